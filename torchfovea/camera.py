@@ -1,0 +1,129 @@
+"""Camera models: where a pixel looks, and where a direction lands.
+
+A retina is described in pixels relative to the optical axis; an image of the same field of view is the same camera with
+another focal length and its centre at (size - 1)/2, for pixel centres are integers (`image_camera`).
+Directions are in the optical frame: x right, y down, z forward.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchfovea.gaussian import columns
+from torchfovea.setting import require
+
+__all__ = ["Camera", "Fisheye", "Pinhole", "image_camera"]
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """The paper's camera: px = focal_px · (x, y)/z + centre.
+
+    Attributes:
+        focal_px: focal length [px], > 0.
+        cx_px: column of the optical axis [px].
+        cy_px: row of the optical axis [px].
+    """
+
+    focal_px: float
+    cx_px: float = 0.0
+    cy_px: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Raise SettingError unless the focal length is positive and finite."""
+        require(0 < self.focal_px < math.inf, "focal_px", self.focal_px, "a positive number of pixels")
+
+    @staticmethod
+    def from_fov(fov_deg: float, radius_px: float) -> Pinhole:
+        """The camera whose circle of radius `radius_px` spans `fov_deg` degrees (0 < fov_deg < 180)."""
+        require(0 < fov_deg < 180, "fov_deg", fov_deg, "more than 0 and less than 180 degrees for a pinhole camera")
+        return Pinhole(radius_px / math.tan(math.radians(fov_deg) / 2))
+
+    def rays(self, px: Tensor) -> Tensor:
+        """Directions of pixels, (..., 2) to (..., 3) with z = 1. Differentiable."""
+        u, v = px.unbind(-1)
+        return columns((u - self.cx_px) / self.focal_px, (v - self.cy_px) / self.focal_px, torch.ones_like(u))
+
+    def project(self, direction: Tensor) -> Tensor:
+        """Pixels of directions, (..., 3) to (..., 2); finite, and meaningless where `in_view` is false.
+
+        Differentiable.
+        """
+        x, y, z = direction.unbind(-1)
+        z = torch.where(self.in_view(direction), z, torch.ones_like(z))
+        return columns(self.focal_px * x / z + self.cx_px, self.focal_px * y / z + self.cy_px)
+
+    def in_view(self, direction: Tensor) -> Tensor:
+        """Whether directions (..., 3) lie in front of the camera, so that they have a pixel; bool (...)."""
+        return direction[..., 2] > 1e-6 * direction.abs().sum(-1)
+
+
+@dataclass(frozen=True)
+class Fisheye:
+    """Equidistant fisheye: the distance from the centre is focal_px times the angle from the axis.
+
+    Attributes:
+        focal_px: pixels per radian, > 0.
+        cx_px: column of the optical axis [px].
+        cy_px: row of the optical axis [px].
+    """
+
+    focal_px: float
+    cx_px: float = 0.0
+    cy_px: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Raise SettingError unless the focal length is positive and finite."""
+        require(0 < self.focal_px < math.inf, "focal_px", self.focal_px, "a positive number of pixels")
+
+    @staticmethod
+    def from_fov(fov_deg: float, radius_px: float) -> Fisheye:
+        """The camera whose circle of radius `radius_px` spans `fov_deg` degrees (0 < fov_deg < 360)."""
+        require(0 < fov_deg < 360, "fov_deg", fov_deg, "more than 0 and less than 360 degrees for a fisheye camera")
+        return Fisheye(radius_px / (math.radians(fov_deg) / 2))
+
+    def rays(self, px: Tensor) -> Tensor:
+        """Unit directions of pixels, (..., 2) to (..., 3). Differentiable, at the centre too."""
+        u, v = px.unbind(-1)
+        a, b = (u - self.cx_px) / self.focal_px, (v - self.cy_px) / self.focal_px
+        # sin(θ)/θ as sinc keeps value and gradient finite at the centre
+        square = a * a + b * b
+        away = square > 1e-12
+        theta = torch.where(away, square, torch.ones_like(square)).sqrt()
+        ratio = torch.where(away, torch.sin(theta) / theta, 1 - square / 6)
+        cosine = torch.where(away, torch.cos(theta), 1 - square / 2)
+        return columns(a * ratio, b * ratio, cosine)
+
+    def project(self, direction: Tensor) -> Tensor:
+        """Pixels of directions, (..., 3) to (..., 2); finite, and meaningless straight behind. Differentiable."""
+        x, y, z = direction.unbind(-1)
+        square = x * x + y * y
+        away = square > 1e-12 * z * z
+        side = torch.where(away, square, torch.ones_like(square)).sqrt()
+        ahead = torch.where(away, torch.ones_like(z), torch.where(z.abs() > 0, z.abs(), torch.ones_like(z)))
+        ratio = torch.where(away, torch.atan2(side, z) / side, 1 / ahead)
+        return columns(self.focal_px * x * ratio + self.cx_px, self.focal_px * y * ratio + self.cy_px)
+
+    def in_view(self, direction: Tensor) -> Tensor:
+        """Whether directions (..., 3) have a pixel (all but straight behind); bool (...)."""
+        x, y, z = direction.unbind(-1)
+        return (z > 0) | (x * x + y * y > 1e-12 * z * z)
+
+
+Camera = Pinhole | Fisheye
+
+
+def image_camera(camera: Camera, radius_px: float, size_px: int) -> Camera:
+    """The camera of a square image that spans the same field of view as the retina.
+
+    Args:
+        camera: the retina's camera, in retinal pixels.
+        radius_px: the retina's radius ρ_max [retinal px].
+        size_px: side of the image [px]; its outermost pixel borders lie at the retina's radius.
+    """
+    centre = (size_px - 1) / 2
+    return replace(camera, focal_px=camera.focal_px * size_px / (2 * radius_px), cx_px=centre, cy_px=centre)

@@ -1,0 +1,152 @@
+"""Gaussians of three dimensions in moment and in information form, and the symmetric 3x3 algebra they need.
+
+Layout. Tensors keep the component axis last in shape, but outermost in memory (a structure of arrays, see `columns`), so
+that `x.unbind(-1)` gives contiguous components and every formula below runs at the speed of memory. A symmetric matrix is
+packed into six columns in the order (xx, xy, xz, yy, yz, zz).
+
+All functions broadcast over leading axes and are differentiable in every tensor argument.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+__all__ = [
+    "Gaussian",
+    "Information",
+    "columns",
+    "det3",
+    "gaussian_from_information",
+    "information_from_gaussian",
+    "inverse3",
+    "pack",
+    "positive_definite",
+    "quadratic3",
+    "rotate3",
+    "times3",
+    "unpack",
+]
+
+
+class Gaussian(NamedTuple):
+    """Moment form.
+
+    Attributes:
+        mean: (..., 3).
+        cov: packed covariance, (..., 6).
+    """
+
+    mean: Tensor
+    cov: Tensor
+
+
+class Information(NamedTuple):
+    """Information form: vector = matrix @ mean, matrix = inverse covariance.
+
+    Attributes:
+        vector: (..., 3).
+        matrix: packed information matrix, (..., 6).
+    """
+
+    vector: Tensor
+    matrix: Tensor
+
+
+def columns(*components: Tensor) -> Tensor:
+    """Join components (...) into (..., k) with each component contiguous in memory."""
+    return torch.stack(torch.broadcast_tensors(*components)).movedim(0, -1)
+
+
+def pack(matrix: Tensor) -> Tensor:
+    """Upper triangle of symmetric matrices (..., 3, 3) as packed columns (..., 6)."""
+    return columns(*(matrix[..., i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))))
+
+
+def unpack(sym: Tensor) -> Tensor:
+    """Packed (..., 6) as symmetric matrices (..., 3, 3)."""
+    return sym[..., torch.tensor([0, 1, 2, 1, 3, 4, 2, 4, 5], device=sym.device)].unflatten(-1, (3, 3))
+
+
+def det3(sym: Tensor) -> Tensor:
+    """Determinant of packed symmetric matrices, (..., 6) to (...)."""
+    xx, xy, xz, yy, yz, zz = sym.unbind(-1)
+    return xx * (yy * zz - yz * yz) + xy * (xz * yz - xy * zz) + xz * (xy * yz - xz * yy)
+
+
+def inverse3(sym: Tensor) -> Tensor:
+    """Inverse of packed symmetric matrices by cofactors, (..., 6) to (..., 6).
+
+    The matrix is first scaled to a unit diagonal, without which the determinant of a millimetre-thin, decimetre-long
+    covariance would underflow in float32. The diagonal must be positive.
+    """
+    xx, xy, xz, yy, yz, zz = sym.unbind(-1)
+    sx, sy, sz = xx.rsqrt(), yy.rsqrt(), zz.rsqrt()
+    xy, xz, yz = xy * sx * sy, xz * sx * sz, yz * sy * sz
+    c_xx, c_xy, c_xz = 1 - yz * yz, xz * yz - xy, xy * yz - xz
+    scale = 1 / (c_xx + xy * c_xy + xz * c_xz)
+    c_yy, c_yz, c_zz = 1 - xz * xz, xy * xz - yz, 1 - xy * xy
+    return columns(
+        c_xx * scale * sx * sx,
+        c_xy * scale * sx * sy,
+        c_xz * scale * sx * sz,
+        c_yy * scale * sy * sy,
+        c_yz * scale * sy * sz,
+        c_zz * scale * sz * sz,
+    )
+
+
+def positive_definite(sym: Tensor, tolerance: float = 1e-6) -> Tensor:
+    """Whether packed symmetric matrices are finite and positive definite, (..., 6) to bool (...).
+
+    Sylvester's criterion on the matrix scaled to a unit diagonal; `tolerance` bounds the scaled minors from below, so
+    that what passes can be inverted in float32.
+    """
+    xx, xy, xz, yy, yz, zz = sym.unbind(-1)
+    diagonal = (xx > 0) & (yy > 0) & (zz > 0) & torch.isfinite(xx + yy + zz)
+    one = torch.ones((), dtype=sym.dtype, device=sym.device)
+    sx, sy, sz = (torch.where(diagonal, d, one).rsqrt() for d in (xx, yy, zz))
+    xy, xz, yz = xy * sx * sy, xz * sx * sz, yz * sy * sz
+    minor = 1 - xy * xy
+    det = 1 - yz * yz - xy * (xy - xz * yz) - xz * (xz - xy * yz)
+    return diagonal & (minor > tolerance) & (det > tolerance)
+
+
+def times3(sym: Tensor, vector: Tensor) -> Tensor:
+    """Packed symmetric matrices times vectors, (..., 6) and (..., 3) to (..., 3)."""
+    xx, xy, xz, yy, yz, zz = sym.unbind(-1)
+    x, y, z = vector.unbind(-1)
+    return columns(xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z)
+
+
+def quadratic3(sym: Tensor, vector: Tensor) -> Tensor:
+    """The quadratic form vᵀ S v, (..., 6) and (..., 3) to (...)."""
+    xx, xy, xz, yy, yz, zz = sym.unbind(-1)
+    x, y, z = vector.unbind(-1)
+    return xx * x * x + yy * y * y + zz * z * z + 2 * (xy * x * y + xz * x * z + yz * y * z)
+
+
+def rotate3(rotation: Tensor, sym: Tensor) -> Tensor:
+    """Σ' = R Σ Rᵀ (Eq. 27 with one and the same R on both sides).
+
+    Args:
+        rotation: (..., 3, 3), one for all or one for each.
+        sym: packed (..., 6).
+    """
+    rows = rotation.unbind(-2)
+    images = [times3(sym, row) for row in rows]
+    return columns(*((rows[i] * images[j]).sum(-1) for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))))
+
+
+def information_from_gaussian(gaussian: Gaussian) -> Information:
+    """Λ = Σ⁻¹, η = Λ μ."""
+    matrix = inverse3(gaussian.cov)
+    return Information(times3(matrix, gaussian.mean), matrix)
+
+
+def gaussian_from_information(information: Information) -> Gaussian:
+    """Σ = Λ⁻¹, μ = Σ η."""
+    cov = inverse3(information.matrix)
+    return Gaussian(times3(cov, information.vector), cov)

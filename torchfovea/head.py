@@ -1,0 +1,187 @@
+"""The head: two eyes on a neck that pans and tilts, their forward and inverse kinematics.
+
+Frames (x forward, y left, z up unless optical): the ego frame E sits where the pan and tilt axes cross and keeps the
+world's orientation; the neck frame N is E turned by pan (about z, left positive) and tilt (about y, down positive); the
+cyclopean frame C is optical (x right, y down, z forward) with its origin midway between the eyes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchfovea.gaussian import columns
+from torchfovea.setting import require
+
+__all__ = ["Eyes", "Gaze", "Head", "clamp_gaze", "cyclopean", "eyes", "fixate", "to_ego"]
+
+
+class Gaze(NamedTuple):
+    """Where the head looks; all [rad], any common shape (...).
+
+    Attributes:
+        pan: neck pan, positive to the left.
+        tilt: neck tilt, positive down.
+        vergence: angle between the optical axes; each eye turns half of it inward.
+    """
+
+    pan: Tensor
+    tilt: Tensor
+    vergence: Tensor
+
+
+class Eyes(NamedTuple):
+    """Poses of the two cameras in the ego frame: X_E = R X_camera + t.
+
+    Attributes:
+        R_left: (..., 3, 3), columns are the left camera's axes in E.
+        t_left: (..., 3), the left camera's centre in E [m].
+        R_right: (..., 3, 3).
+        t_right: (..., 3) [m].
+    """
+
+    R_left: Tensor
+    t_left: Tensor
+    R_right: Tensor
+    t_right: Tensor
+
+
+@dataclass(frozen=True)
+class Head:
+    """Geometry and limits of a stereo head; the defaults are Vizzy's.
+
+    Attributes:
+        baseline_m: distance between the eyes, > 0.
+        eyes_forward_m: the eyes before the tilt axis, at tilt 0.
+        eyes_up_m: the eyes above the tilt axis, at tilt 0.
+        ego_height_m: height of the pan-tilt crossing above the floor.
+        pan_limit_deg: neck pan reaches this far to either side.
+        tilt_up_deg: neck tilt upward.
+        tilt_down_deg: neck tilt downward.
+        vergence_max_deg: largest angle between the optical axes.
+    """
+
+    baseline_m: float = 0.204
+    eyes_forward_m: float = 0.048
+    eyes_up_m: float = 0.124
+    ego_height_m: float = 0.54
+    pan_limit_deg: float = 53.0
+    tilt_up_deg: float = 18.0
+    tilt_down_deg: float = 37.0
+    vergence_max_deg: float = 40.0
+
+    def __post_init__(self) -> None:
+        """Raise SettingError for a head that cannot exist."""
+        require(self.baseline_m > 0, "head.baseline_m", self.baseline_m, "a positive distance in metres")
+        require(0 < self.pan_limit_deg < 180, "head.pan_limit_deg", self.pan_limit_deg, "between 0 and 180 degrees")
+        for name in ("tilt_up_deg", "tilt_down_deg"):
+            require(0 <= getattr(self, name) < 90, f"head.{name}", getattr(self, name), "from 0 to less than 90 degrees")
+        require(self.tilt_up_deg + self.tilt_down_deg > 0, "head.tilt_down_deg", self.tilt_down_deg, "some tilt range")
+        require(
+            0 < self.vergence_max_deg < 180, "head.vergence_max_deg", self.vergence_max_deg, "between 0 and 180 degrees"
+        )
+        for name in ("eyes_forward_m", "eyes_up_m", "ego_height_m"):
+            require(math.isfinite(getattr(self, name)), f"head.{name}", getattr(self, name), "a finite length in metres")
+
+
+def _rotation(rows: tuple[tuple[Tensor, ...], ...]) -> Tensor:
+    """Matrices (..., 3, 3) from components (...)."""
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def cyclopean(head: Head, gaze: Gaze) -> tuple[Tensor, Tensor]:
+    """Pose of the cyclopean frame in E.
+
+    Returns:
+        R (..., 3, 3), whose columns are C's x (right), y (down) and z (forward) axes in E, and its origin t (..., 3) [m].
+
+    Differentiable in the gaze.
+    """
+    cp, sp = torch.cos(gaze.pan), torch.sin(gaze.pan)
+    ct, st = torch.cos(gaze.tilt), torch.sin(gaze.tilt)
+    zero = torch.zeros_like(cp)
+    # columns: right, down, forward = -y, -z, x of the neck frame, whose axes are R_z(pan) R_y(tilt)
+    rotation = _rotation(((sp, -cp * st, cp * ct), (-cp, -sp * st, sp * ct), (zero, -ct, -st)))
+    return rotation, head.eyes_forward_m * rotation[..., 2] - head.eyes_up_m * rotation[..., 1]
+
+
+def eyes(head: Head, gaze: Gaze) -> Eyes:
+    """Forward kinematics: the poses of both cameras in E (the left eye turns +θ/2 about the optical y, the right −θ/2).
+
+    Differentiable in the gaze.
+    """
+    rotation, origin = cyclopean(head, gaze)
+    c, s = torch.cos(gaze.vergence / 2), torch.sin(gaze.vergence / 2)
+    zero, one = torch.zeros_like(c), torch.ones_like(c)
+    inward = _rotation(((c, zero, s), (zero, one, zero), (-s, zero, c)))
+    half = head.baseline_m / 2 * rotation[..., 0]
+    return Eyes(rotation @ inward, origin - half, rotation @ inward.mT, origin + half)
+
+
+def to_ego(rotation: Tensor, vector: Tensor) -> Tensor:
+    """R v for each of N vectors.
+
+    Args:
+        rotation: (..., 3, 3).
+        vector: (*any, ..., N, 3).
+
+    Returns:
+        The shape of `vector`, in columns. Differentiable.
+    """
+    x, y, z = vector.unbind(-1)
+    row = [[rotation[..., i, j].unsqueeze(-1) for j in range(3)] for i in range(3)]
+    return columns(*(r[0] * x + r[1] * y + r[2] * z for r in row))
+
+
+def fixate(head: Head, point: Tensor) -> tuple[Gaze, Tensor]:
+    """Inverse kinematics: the gaze in which both optical axes meet at a point.
+
+    Args:
+        head: geometry and limits.
+        point: (..., 3) in E [m].
+
+    Returns:
+        The gaze, clamped to the limits (so always one that the head can take), and whether it does meet the point:
+        bool (...). A point behind, too near, out of limits or not finite is unreachable, never NaN.
+
+    Differentiable in the point where it is reachable; zero gradient where it is not.
+    """
+    finite = torch.isfinite(point).all(-1)
+    x, y, z = torch.where(finite[..., None], point, torch.ones_like(point)).unbind(-1)
+    side = x * x + y * y
+    up, forward = head.eyes_up_m, head.eyes_forward_m
+    # in the neck's vertical plane the point is at (d + forward, up): |X|² = (d + forward)² + up²
+    ahead = side + z * z - up * up
+    near = head.baseline_m / 2 / math.tan(math.radians(head.vergence_max_deg) / 2)
+    solvable = finite & (side > 1e-12) & (ahead > max(forward + 1e-3, 1e-3) ** 2)
+    one = torch.ones_like(x)
+    xs, ys, zs = (torch.where(solvable, c, one) for c in (x, y, z))
+    reach = torch.where(solvable, ahead, one).sqrt()
+    distance = (reach - forward).clamp(min=1e-6)
+    pan = torch.atan2(ys, xs)
+    tilt = torch.atan2(torch.full_like(reach, up), reach) - torch.atan2(zs, (xs * xs + ys * ys).sqrt())
+    vergence = 2 * torch.atan2(torch.full_like(distance, head.baseline_m / 2), distance)
+    pan_limit, up_limit, down_limit = (
+        math.radians(a) for a in (head.pan_limit_deg, -head.tilt_up_deg, head.tilt_down_deg)
+    )
+    within = (pan.abs() <= pan_limit) & (tilt >= up_limit) & (tilt <= down_limit) & (distance >= near)
+    gaze = Gaze(
+        pan.clamp(-pan_limit, pan_limit),
+        tilt.clamp(up_limit, down_limit),
+        vergence.clamp(max=math.radians(head.vergence_max_deg)),
+    )
+    ahead_only = [torch.where(solvable, angle, torch.zeros_like(angle)) for angle in gaze]
+    return Gaze(*ahead_only), solvable & within
+
+
+def clamp_gaze(head: Head, gaze: Gaze) -> Gaze:
+    """The nearest gaze within the head's limits."""
+    pan, up, down, widest = (
+        math.radians(a) for a in (head.pan_limit_deg, head.tilt_up_deg, head.tilt_down_deg, head.vergence_max_deg)
+    )
+    return Gaze(gaze.pan.clamp(-pan, pan), gaze.tilt.clamp(-up, down), gaze.vergence.clamp(0.0, widest))
+
