@@ -1,0 +1,194 @@
+"""``torchfovea COMMAND [setting=value ...]``: finds the command, runs it as a Hydra app, words the mistakes."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+import shutil
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torchfovea
+
+__all__ = ["COMMANDS", "Command", "main"]
+
+
+class Command(NamedTuple):
+    """A command: where its function lies (imported only when chosen), and its lines in the help."""
+
+    target: str
+    summary: str
+    example: str
+
+
+# A command NAME is a function of its composed configuration conf/NAME.yaml; what it returns is the score that
+# Hydra's sweepers see.
+COMMANDS: dict[str, Command] = {
+    "doctor": Command("torchfovea.doctor:run", "what this machine can render and has", "torchfovea doctor"),
+}
+
+
+class JobFailed(Exception):
+    """One job of a sweep failed, and that has been said."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command.
+
+    Args:
+        arguments: the command and its settings; the process's own by default.
+
+    Returns:
+        The exit status: 0, 1 for a run that failed, 2 for an unknown command, 130 after Ctrl-C.
+    """
+    chosen, *overrides = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    if chosen in ("-h", "--help"):
+        print(_help())
+        return 0
+    if chosen == "--version":
+        print(f"torchfovea {torchfovea.__version__}")
+        return 0
+    if chosen not in COMMANDS:
+        from torchfovea.mistakes import closest
+
+        _complain("torchfovea", f"command = {chosen}: expected one of {', '.join(COMMANDS)}{closest(chosen, COMMANDS)}")
+        return 2
+    try:
+        return _run(chosen, overrides)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        # The reader of our output has gone; leave nothing for the interpreter to flush at its exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+
+
+def _help() -> str:
+    width = max(map(len, COMMANDS))
+    lines = ["torchfovea COMMAND [setting=value ...]", "", "commands:"]
+    lines += [f"  {name:<{width}}  {command.summary}" for name, command in COMMANDS.items()]
+    lines += ["", "examples:"]
+    lines += [f"  {command.example}" for command in COMMANDS.values()]
+    lines += ["", "torchfovea COMMAND --help lists a command's settings; HYDRA_FULL_ERROR=1 shows whole tracebacks."]
+    return "\n".join(lines)
+
+
+def _complain(who: str, line: str) -> None:
+    print(f"{who}: {line}", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def _as_program(command: str, overrides: list[str]) -> Iterator[None]:
+    """Let Hydra see the command's own arguments and raise its errors to us; put everything back afterwards."""
+    arguments, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
+    sys.argv = [f"torchfovea {command}", *overrides]
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    try:
+        yield
+    finally:
+        sys.argv = arguments
+        if full_error is None:
+            del os.environ["HYDRA_FULL_ERROR"]
+        else:
+            os.environ["HYDRA_FULL_ERROR"] = full_error
+        _close_logs()
+
+
+def _close_logs() -> None:
+    """Close the run's log file."""
+    root = logging.getLogger()
+    for handler in list(root.handlers):
+        if isinstance(handler, logging.FileHandler):
+            root.removeHandler(handler)
+            handler.close()
+
+
+def _run(command: str, overrides: list[str]) -> int:
+    import hydra
+
+    from torchfovea.config import SweepFolder, conf_dir
+    from torchfovea.mistakes import describe
+
+    full_error = os.environ.get("HYDRA_FULL_ERROR") == "1"
+    SweepFolder.latest = None
+    status = 0
+    with _as_program(command, overrides):
+        app = hydra.main(version_base="1.3", config_path=conf_dir(), config_name=command)
+        try:
+            app(_job(command, overrides, full_error))()
+        except JobFailed:
+            status = 1
+        except SystemExit as stop:
+            status = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+        except Exception as error:
+            line = None if full_error else describe(error, overrides, _known_settings(command))
+            if line is None:
+                raise
+            _complain(f"torchfovea {command}", line)
+            status = 1
+    if SweepFolder.latest is not None:
+        print(SweepFolder.latest, flush=True)
+    return status
+
+
+def _known_settings(command: str) -> list[str]:
+    from hydra import compose, initialize_config_dir
+
+    from torchfovea.config import conf_dir
+    from torchfovea.mistakes import setting_names
+
+    with initialize_config_dir(conf_dir(), version_base="1.3"):
+        return setting_names(compose(config_name=command))
+
+
+def _job(command: str, overrides: list[str], full_error: bool) -> Callable[[Any], Any]:
+    """The function that Hydra calls, once for a run and once for each job of a sweep."""
+
+    def job(cfg: Any) -> Any:
+        from hydra.core.hydra_config import HydraConfig
+        from omegaconf import OmegaConf
+
+        from torchfovea.config import run_folder
+        from torchfovea.mistakes import describe
+
+        folder = run_folder()
+        settings = HydraConfig.get().job
+        sweeping = not OmegaConf.is_missing(settings, "num")
+        try:
+            module, _, function = COMMANDS[command].target.partition(":")
+            score = getattr(importlib.import_module(module), function)(cfg)
+        except Exception as error:
+            if full_error:
+                raise
+            line = describe(error, list(HydraConfig.get().overrides.task) if sweeping else overrides)
+            unforeseen = line is None
+            if line is None:
+                traceback.print_exc()
+                line = f"{type(error).__name__}: {error}"
+            if sweeping:
+                # Hydra goes on with the other jobs, and raises this at the end.
+                what = settings.override_dirname
+                _complain(f"torchfovea {command}: job {settings.num} ({what})", line)
+                raise JobFailed(line) from None
+            if not unforeseen:
+                _complain(f"torchfovea {command}", line)
+            _close_logs()
+            _remove_bare(folder, settings.name)
+            # Not an Exception, so that Hydra adds no line of its own.
+            raise SystemExit(1) from None
+        print(folder, flush=True)
+        return score
+
+    return job
+
+
+def _remove_bare(folder: Path, name: str) -> None:
+    """Remove the folder of a run that failed before it wrote anything, if it holds Hydra's own files only."""
+    if {entry.name for entry in folder.iterdir()} <= {".hydra", f"{name}.log"}:
+        shutil.rmtree(folder, ignore_errors=True)

@@ -1,0 +1,108 @@
+"""What a run leaves behind: every file appears whole or not at all."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+__all__ = ["replacing", "write_csv", "write_figure", "write_json", "write_result"]
+
+
+@contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Give a temporary path beside ``path``; it takes the place of ``path`` once the block ends without an error.
+
+    Args:
+        path: the file to write; its folder is made where it is missing.
+
+    Yields:
+        A path in the same folder with the same suffix (writers that go by the suffix work).
+
+    Raises:
+        OSError: if the folder cannot be written. After any error inside the block ``path`` is as it was.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        # mkstemp makes files that only their owner can read; give the rights any new file would have here.
+        mask = os.umask(0)
+        os.umask(mask)
+        temporary.chmod(0o666 & ~mask)
+        os.replace(temporary, path)
+    finally:
+        with suppress(FileNotFoundError):
+            temporary.unlink()
+
+
+def _plain(value: Any) -> Any:
+    """A value as JSON knows it: tensors, arrays and NumPy numbers unpacked, whatever is not finite as None."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    return value
+
+
+def write_json(path: str | os.PathLike[str], content: Any) -> None:
+    """Write JSON whose keys keep their order (dots in them mean nothing) and whose NaN and infinities are null.
+
+    Args:
+        path: the file.
+        content: mappings, sequences, strings, numbers, tensors and arrays.
+
+    Raises:
+        TypeError: for content that JSON has no form for; nothing is written then.
+    """
+    text = json.dumps(_plain(content), indent=2, allow_nan=False, ensure_ascii=False)
+    with replacing(path) as temporary:
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def write_result(folder: str | os.PathLike[str], figures: Mapping[str, Any]) -> None:
+    """Write a run's ``result.json``; call it last, since its presence says that the run is complete."""
+    write_json(Path(folder) / "result.json", figures)
+
+
+def write_csv(path: str | os.PathLike[str], columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Write a table: floats in the fewest digits that read back the same; NaN, infinities and None as empty cells.
+
+    Args:
+        path: the file.
+        columns: the header.
+        rows: each as long as the header.
+
+    Raises:
+        ValueError: for a row of another length; nothing is written then.
+    """
+    with replacing(path) as temporary:
+        with temporary.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(columns)
+            for number, row in enumerate(rows):
+                if len(row) != len(columns):
+                    raise ValueError(f"row {number} of {Path(path).name} has {len(row)} cells: expected {len(columns)}")
+                cells = [_plain(cell) for cell in row]
+                writer.writerow(["" if cell is None else cell for cell in cells])
+
+
+def write_figure(path: str | os.PathLike[str], figure: Any, **options: Any) -> None:
+    """Write a matplotlib figure in the format of the path's suffix; ``options`` go to its ``savefig``."""
+    with replacing(path) as temporary:
+        figure.savefig(temporary, **options)

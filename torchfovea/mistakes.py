@@ -1,0 +1,169 @@
+"""A user's mistake in one line: the setting, its value and what was expected; programming errors are left alone."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from hydra.errors import (
+    HydraException,
+    InstantiationException,
+    MissingConfigException,
+    OverrideParseException,
+)
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import (
+    ConfigAttributeError,
+    ConfigKeyError,
+    InterpolationResolutionError,
+    MissingMandatoryValue,
+    OmegaConfBaseException,
+    ValidationError,
+)
+
+from torchfovea.setting import SettingError
+
+__all__ = ["closest", "describe", "setting_names"]
+
+# The extra that brings each optional module.
+EXTRAS = {
+    "cv2": "stereo",
+    "matplotlib": "viz",
+    "rich": "viz",
+    "skimage": "samples",
+    "cma": "tune",
+    "optuna": "tune",
+}
+
+
+def closest(name: str, names: Iterable[str]) -> str:
+    """A hint at the nearest of ``names``, or an empty string where none is near."""
+    near = difflib.get_close_matches(name, list(names), n=1)
+    return f" (did you mean {near[0]}?)" if near else ""
+
+
+def setting_names(cfg: DictConfig) -> list[str]:
+    """The dotted names of all settings of a composed configuration, Hydra's own left out."""
+    names: list[str] = []
+
+    def walk(node: Any, prefix: str) -> None:
+        for key, child in node.items() if isinstance(node, dict) else ():
+            names.append(f"{prefix}{key}")
+            walk(child, f"{prefix}{key}.")
+
+    walk(OmegaConf.to_container(cfg, resolve=False), "")
+    return [name for name in names if name.partition(".")[0] != "hydra"]
+
+
+def describe(error: BaseException, overrides: Sequence[str], known: Iterable[str] = ()) -> str | None:
+    """Say a user's mistake in one line.
+
+    Args:
+        error: what was raised.
+        overrides: the command's arguments, for the values as they were typed.
+        known: the names of the settings that exist, for a hint at the nearest one.
+
+    Returns:
+        The line, or None for an error that is the program's own (its traceback should be shown).
+    """
+    if isinstance(error, InstantiationException):
+        line = _instantiation(error, overrides)
+    elif isinstance(error, HydraException):
+        line = _composition(error, overrides, known)
+    elif isinstance(error, SettingError):
+        line = str(error)
+    elif isinstance(error, OmegaConfBaseException):
+        line = _configuration(error, overrides)
+    elif isinstance(error, ModuleNotFoundError):
+        line = _missing_module(error)
+    elif isinstance(error, OSError):
+        line = _file(error, overrides)
+    else:
+        line = None
+    return None if line is None else " ".join(line.split())
+
+
+def _value(name: str, overrides: Sequence[str]) -> str | None:
+    """The value typed for a setting, if any."""
+    for override in reversed(overrides):
+        key, equals, value = override.partition("=")
+        if equals and key.lstrip("+~").split("@")[0] == name:
+            return value
+    return None
+
+
+def _given(name: str, overrides: Sequence[str]) -> str:
+    """``name = value`` as typed, or the bare name where the value was not typed."""
+    value = _value(name, overrides)
+    return name if value is None else f"{name} = {value}"
+
+
+def _first_line(error: BaseException) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[0] if lines else type(error).__name__
+
+
+def _composition(error: HydraException, overrides: Sequence[str], known: Iterable[str]) -> str:
+    if isinstance(error, OverrideParseException):
+        if "=" not in error.override:
+            return f"{error.override}: expected SETTING=VALUE"
+        return f"{error.override}: expected a value that Hydra can read ({_first_line(error)})"
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file:
+        group, _, option = error.missing_cfg_file.rpartition("/")
+        if error.options and group:
+            return f"{group} = {option}: expected one of {', '.join(sorted(error.options))}"
+        return f"config = {error.missing_cfg_file}: expected a file of the configuration's folder"
+    cause = error.__cause__
+    if isinstance(cause, (ConfigAttributeError, ConfigKeyError)):
+        # Hydra's message names the whole override's key; OmegaConf's may name only the part that is missing.
+        quoted = re.search(r"'([^']+)'", str(error))
+        name = quoted[1] if quoted else str(cause.full_key)
+        return f"{_given(name, overrides)}: expected a known setting{closest(name, known)}"
+    if isinstance(cause, OmegaConfBaseException):
+        return _configuration(cause, overrides) or _first_line(error)
+    return _first_line(error)
+
+
+def _configuration(error: OmegaConfBaseException, overrides: Sequence[str]) -> str | None:
+    name = str(error.full_key) if error.full_key else ""
+    if isinstance(error, MissingMandatoryValue):
+        missing = re.search(r"Missing mandatory value: (\S+)", str(error))
+        return f"{name or (missing[1] if missing else 'setting')} = ???: expected a value"
+    if isinstance(error, (ValidationError, InterpolationResolutionError)):
+        return f"{_given(name, overrides)}: {_first_line(error)}" if name else _first_line(error)
+    return None  # a key that the program asks for and no configuration has: the program's own mistake
+
+
+def _instantiation(error: InstantiationException, overrides: Sequence[str]) -> str | None:
+    cause = error.__cause__
+    found = re.search(r"full_key: (\S+)", str(error))
+    node = found[1] if found else ""
+    if isinstance(cause, TypeError) and (unexpected := re.search(r"unexpected keyword argument '(\w+)'", str(cause))):
+        return f"{_given(f'{node}.{unexpected[1]}'.lstrip('.'), overrides)}: expected a setting that {node} has"
+    if cause is None:
+        return None
+    line = describe(cause, overrides)
+    if isinstance(cause, SettingError) and line and node and not line.startswith(f"{node}."):
+        line = f"{node}.{line}"
+    return line
+
+
+def _missing_module(error: ModuleNotFoundError) -> str | None:
+    module = (error.name or "").partition(".")[0]
+    if module not in EXTRAS:
+        return None
+    extra = EXTRAS[module]
+    return f"{module} is not installed: expected the extra {extra} (pip install 'torchfovea[{extra}]')"
+
+
+def _file(error: OSError, overrides: Sequence[str]) -> str:
+    if error.filename is None:
+        return _first_line(error)
+    path = str(error.filename)
+    reason = error.strerror or type(error).__name__
+    names = [
+        key.lstrip("+") for key, equals, value in (o.partition("=") for o in overrides) if equals and value == path
+    ]
+    return f"{names[0]} = {path}: {reason}" if names else f"{path}: {reason}"
