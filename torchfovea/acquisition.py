@@ -98,7 +98,7 @@ def probability_of_improvement(mean: Tensor, std: Tensor, incumbent: float | Ten
     Returns:
         (..., N) in [0, 1]. Differentiable; gradients are finite at σ = 0.
     """
-    return torch.special.ndtr(_standardised(mean, std, incumbent)[0])
+    return _normal_cdf(_standardised(mean, std, incumbent)[0])
 
 
 def log_probability_of_improvement(mean: Tensor, std: Tensor, incumbent: float | Tensor) -> Tensor:
@@ -173,6 +173,11 @@ def thompson(mean: Tensor, std: Tensor, generator: Generators) -> Tensor:
     return mean + std * _draw(torch.randn, mean.shape, mean, generator)
 
 
+def _normal_cdf(z: Tensor) -> Tensor:
+    """Φ(z). `torch.special.ndtr` goes through 1 + erf and has no digit left at z = −8, nor in float32 at z = −5."""
+    return 0.5 * torch.erfc(-math.sqrt(0.5) * z)
+
+
 def _standardised(mean: Tensor, std: Tensor, incumbent: float | Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return z = difference/σ, the difference and σ; σ is floored only so far that z² and gradients stay finite."""
     if isinstance(incumbent, Tensor):
@@ -189,7 +194,7 @@ def _improvement(mean: Tensor, std: Tensor, incumbent: float | Tensor) -> tuple[
     z_near = torch.where(far, 0.0, z)
     # Written so, and not σ(z Φ + φ), the gradient with respect to σ is φ with no cancellation at large z.
     density = torch.exp(-0.5 * z_near * z_near - _LOG_SQRT_2PI)
-    near = torch.where(far, 0.0, difference) * torch.special.ndtr(z_near) + std * density
+    near = torch.where(far, 0.0, difference) * _normal_cdf(z_near) + std * density
     x = torch.where(far, -z, 1.0)
     ratio = _ratio(x)
     return near, far, torch.log(std) - 0.5 * x * x - _LOG_SQRT_2PI + torch.log(ratio / (x + ratio))
@@ -277,7 +282,7 @@ def precision_by_eccentricity(
     angle = 2 * torch.asin((chord / 2).clamp(max=1 - torch.finfo(chord.dtype).eps))
     seen = angle <= half_view_rad
     sigma = law(torch.where(seen, angle, 0.0))
-    return torch.where(seen, sigma**-2, 0.0)
+    return torch.where(seen, 1 / (sigma * sigma), 0.0)
 
 
 def eccentricity_law(sigma_fovea: float, sigma_per_rad: float) -> Callable[[Tensor], Tensor]:
@@ -322,7 +327,7 @@ def saccade_degrees(direction: Tensor, directions: Tensor) -> Tensor:
     Returns:
         (..., N). Differentiable, with gradient 0 at an angle of exactly 0 or 180.
     """
-    now = direction[..., None, :]
+    now, directions = torch.broadcast_tensors(direction[..., None, :], directions)
     cross2 = torch.linalg.cross(now, directions).square().sum(-1)
     turned = cross2 > 0
     sine = torch.where(turned, torch.sqrt(torch.where(turned, cross2, 1.0)), 0.0)
@@ -533,7 +538,7 @@ def known_well_enough(mean: Tensor, std: Tensor, eligible: Tensor, tolerance: fl
     best = torch.where(valid, mean, -torch.inf).argmax(-1, keepdim=True)
     others = valid & (torch.arange(mean.shape[-1], device=mean.device) != best)
     spread = torch.sqrt(std.square() + std.gather(-1, best).square()).clamp_min(torch.finfo(mean.dtype).tiny ** 0.25)
-    beaten = torch.special.ndtr((mean - mean.gather(-1, best) - tolerance) / spread)
+    beaten = _normal_cdf((mean - mean.gather(-1, best) - tolerance) / spread)
     return (torch.where(others, beaten, 0.0).sum(-1) < probability) & valid.any(-1)
 
 

@@ -1,8 +1,8 @@
 """What an episode achieved, and how honest its uncertainties were (Sec. 7.2.1, Eq. 44-55).
 
 Rewards here are true ones: r_t = −‖x_t‖ of the first surface on the executed line of sight, never a belief. Time is the
-last axis, T long, and t = 1 is the initial gaze, which counts. A quantity "per saccade" is the mean of its series over T
-(Eq. 49, 51, 53, 55). The judgement of uncertainty works on z = error/σ with one degree of freedom, or on error and
+last axis, T long, and t = 1 is the initial gaze, which counts. A quantity "per saccade" is the mean of its series over
+T (Eq. 49, 51, 53, 55). The judgement of uncertainty works on z = error/σ with one degree of freedom, or on error and
 variance. The scene is the unit of statistics: average over seeds within a scene first, then compare paired over scenes.
 """
 
@@ -53,8 +53,8 @@ def gap(rewards: Tensor, best: Tensor) -> Tensor:
         best: r* (...), of the whole scene (Eq. 47).
 
     Returns:
-        (..., T), clamped to [0, 1] (a ray may pass the best by a rounding), never falling; 1 where the first fixation is
-        already the best.
+        (..., T), clamped to [0, 1] (a ray may pass the best by a rounding), never falling; 1 where the first fixation
+        is already the best.
     """
     first = rewards[..., :1]
     room = best[..., None] - first
@@ -110,8 +110,8 @@ def information(cov: Tensor) -> Tensor:
     """I(Σ) = −log|Σ| (Eq. 44), with Σ in m² [nats].
 
     In float64 inside, through the pivots of Σ: a thin covariance has a determinant below what float32 can resolve. A
-    pivot is taken as at least the rounding error of its diagonal entry, so that a covariance which is singular in its own
-    dtype has finite information.
+    pivot is taken as at least the rounding error of its diagonal entry, so that a covariance which is singular in its
+    own dtype has finite information.
 
     Args:
         cov: packed covariances (xx, xy, xz, yy, yz, zz), (..., 6).
@@ -222,7 +222,7 @@ def coverage(z: Tensor, levels: Sequence[float] = (0.5, 0.9, 0.95, 0.99), valid:
 
 
 def gaussian_nll(error: Tensor, variance: Tensor) -> Tensor:
-    """Negative log likelihood ½(error²/variance + log 2π variance) [nats], elementwise; variance > 0. Differentiable."""
+    """Negative log likelihood ½(error²/variance + log 2π variance) [nats], elementwise. Differentiable."""
     return 0.5 * (error.square() / variance + torch.log(2 * math.pi * variance))
 
 
@@ -230,8 +230,8 @@ def ause(error: Tensor, uncertainty: Tensor, valid: Tensor | None = None) -> Ten
     """Area under the sparsification error (Ilg et al. 2018): whether uncertainty ranks the errors.
 
     The mean |error| of what is left when the most uncertain share f is removed, less the same when the worst errors are
-    removed, integrated over f in [0, 1) at every single removal and divided by the mean |error|. 0 is a perfect ranking;
-    only the order of `uncertainty` matters.
+    removed, integrated over f in [0, 1) at every single removal and divided by the mean |error|. 0 is a perfect
+    ranking; only the order of `uncertainty` matters.
 
     Args:
         error: any shape.
@@ -274,8 +274,8 @@ def bootstrap_interval(
 ) -> Interval:
     """Mean over scenes with its bootstrap interval, bias-corrected and accelerated (Efron 1987, BCa).
 
-    For a paired comparison give the differences scene by scene. All columns are resampled alike, so that curves over time
-    or settings stay paired. With fewer than about ten scenes any bootstrap interval is somewhat too short.
+    For a paired comparison give the differences scene by scene. All columns are resampled alike, so that curves over
+    time or settings stay paired. With fewer than about ten scenes any bootstrap interval is somewhat too short.
 
     Args:
         values: one for each scene, finite, (S, ...); S ≥ 2.
@@ -358,7 +358,8 @@ def holm(p_values: Tensor) -> Tensor:
         p_values: (K,), each in [0, 1].
 
     Returns:
-        Adjusted p-values (K,) in the same order: reject where at most the level; the family-wise error is bounded by it.
+        Adjusted p-values (K,) in the same order: reject where at most the level, which bounds the
+        family-wise error.
 
     Raises:
         SettingError: not one axis, or a value outside [0, 1].
