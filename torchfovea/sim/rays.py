@@ -1,0 +1,189 @@
+"""Rays through a scene: ranges, and pictures without any GL."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchfovea.camera import Camera
+from torchfovea.setting import require
+from torchfovea.sim.backend import load_mujoco
+from torchfovea.sim.model import Scene
+from torchfovea.sim.texture import colour
+
+__all__ = ["MISS_RANGE_M", "Frame", "RayHits", "cast", "render"]
+
+MISS_RANGE_M = 1000.0
+"""The range that a ray gets which meets nothing; its geom is -1."""
+
+_PARALLEL_FROM = 4000  # rays below which a second thread costs more than it saves
+
+
+class RayHits(NamedTuple):
+    """First surfaces on N rays.
+
+    Attributes:
+        range_m: (N,) distance along the ray, MISS_RANGE_M where it meets nothing.
+        geom: (N,) int64, -1 for a miss.
+        normal: (N, 3) of the surface, in E; zero for a miss.
+    """
+
+    range_m: Tensor
+    geom: Tensor
+    normal: Tensor
+
+
+class Frame(NamedTuple):
+    """A picture and the truth behind it.
+
+    Attributes:
+        image: (3, H, W) RGB in [0, 1], float32.
+        range_m: (H, W) distance from the camera's centre along each pixel's ray, MISS_RANGE_M for a miss.
+        geom: (H, W) int64, -1 for a miss.
+        normal: (H, W, 3) in E.
+    """
+
+    image: Tensor
+    range_m: Tensor
+    geom: Tensor
+    normal: Tensor
+
+
+@lru_cache(maxsize=1)
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(2, thread_name_prefix="torchfovea-rays")
+
+
+def _cast_world(scene: Scene, origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Ranges, geoms and normals of unit directions (N, 3) float64, all in the world."""
+    mujoco = load_mujoco()
+    n = len(direction)
+    geom, distance, normal = np.empty(n, np.int32), np.empty(n), np.empty((n, 3))
+
+    def part(data: object, rows: slice) -> None:
+        # MuJoCo wants the vectors flat
+        mujoco.mj_multiRay(
+            scene.model, data, origin, direction[rows].reshape(-1), None, True, -1, geom[rows], distance[rows],
+            normal[rows].reshape(-1), rows.stop - rows.start, mujoco.mjMAXVAL,
+        )  # fmt: skip
+
+    if n < _PARALLEL_FROM or torch.get_num_threads() < 2:
+        part(scene.data[0], slice(0, n))
+    else:
+        # mj_multiRay works on the stack of its MjData: one for each thread
+        half = _pool().submit(part, scene.data[1], slice(n // 2, n))
+        part(scene.data[0], slice(0, n // 2))
+        half.result()
+    miss = geom < 0
+    if miss.any():
+        distance[miss] = MISS_RANGE_M
+        normal[miss] = 0
+    return distance, geom, normal
+
+
+def cast(scene: Scene, origin_e: Tensor, directions_e: Tensor) -> RayHits:
+    """Meet the scene's surfaces with rays from one point. Not differentiable.
+
+    Args:
+        scene: what to look at; not from two threads at once.
+        origin_e: (3,) in E [m].
+        directions_e: (N, 3) in E, of any positive length.
+
+    Returns:
+        Hits in the directions' dtype; rays are cast in float64.
+
+    Raises:
+        SettingError: wrong shapes, or numbers that are not finite.
+    """
+    require(directions_e.dim() == 2 and directions_e.shape[1] == 3, "directions_e", tuple(directions_e.shape), "(N, 3)")
+    require(origin_e.shape == (3,), "origin_e", tuple(origin_e.shape), "(3,)")
+    d = directions_e.detach().to("cpu", torch.float64).numpy()
+    if len(d) == 0:
+        return RayHits(directions_e[:, 0], torch.empty(0, dtype=torch.long), directions_e)
+    length = np.sqrt(np.einsum("ni,ni->n", d, d))
+    require(bool(np.isfinite(length).all() and (length > 0).all()), "directions_e", "zero or not finite", "directions")
+    rotation, translation = scene.world_from_ego
+    origin = rotation @ origin_e.detach().to("cpu", torch.float64).numpy() + translation
+    require(bool(np.isfinite(origin).all()), "origin_e", origin_e.tolist(), "a finite point")
+    distance, geom, normal = _cast_world(scene, origin, (d / length[:, None]) @ rotation.T)
+    dtype = directions_e.dtype
+    return RayHits(
+        torch.from_numpy(distance).to(dtype),
+        torch.from_numpy(geom).long(),
+        torch.from_numpy(normal @ rotation).to(dtype),
+    )
+
+
+@lru_cache(maxsize=8)
+def _pixel_rays(camera: Camera, size_px: int) -> tuple[np.ndarray, Tensor]:
+    """Unit rays (H·W, 3) and the angle that each pixel spans (H·W,) [rad]."""
+    index = torch.arange(size_px, dtype=torch.float64)
+    v, u = torch.meshgrid(index, index, indexing="ij")
+    px = torch.stack([u, v], -1)
+    ray = torch.nn.functional.normalize(camera.rays(px), dim=-1)
+    spans = []
+    for step in ((0.5, 0.0), (0.0, 0.5)):
+        shift = torch.tensor(step, dtype=torch.float64)
+        ends = [torch.nn.functional.normalize(camera.rays(px + s * shift), dim=-1) for s in (-1, 1)]
+        spans.append((ends[1] - ends[0]).norm(dim=-1))
+    return ray.reshape(-1, 3).numpy(), torch.maximum(*spans).reshape(-1).float()
+
+
+def render(scene: Scene, R: Tensor, t: Tensor, camera: Camera, size_px: int) -> Frame:
+    """A square picture by ray casting, textured by `torchfovea.sim.texture`. Not differentiable.
+
+    Args:
+        scene: what to look at.
+        R: (3, 3), columns are the camera's axes in E.
+        t: (3,), the camera's centre in E [m].
+        camera: of the image (`torchfovea.camera.image_camera`); pixel centres are integers.
+        size_px: side of the picture, >= 2.
+
+    Raises:
+        SettingError: wrong shapes or size.
+    """
+    require(isinstance(size_px, int) and 2 <= size_px <= 8192, "size_px", size_px, "a whole number from 2 to 8192")
+    require(R.shape == (3, 3), "R", tuple(R.shape), "(3, 3)")
+    require(t.shape == (3,), "t", tuple(t.shape), "(3,)")
+    ray, span = _pixel_rays(camera, size_px)
+    rotation, translation = scene.world_from_ego
+    turn = rotation @ R.detach().to("cpu", torch.float64).numpy()
+    origin = rotation @ t.detach().to("cpu", torch.float64).numpy() + translation
+    direction = ray @ turn.T
+    distance, geom, normal = _cast_world(scene, origin, direction)
+    image = shade(scene, origin, direction, distance, geom, normal, span)
+    shape = (size_px, size_px)
+    return Frame(
+        image.T.reshape(3, *shape).contiguous(),
+        torch.from_numpy(distance).float().reshape(shape),
+        torch.from_numpy(geom).long().reshape(shape),
+        torch.from_numpy(normal @ rotation).float().reshape(*shape, 3),
+    )
+
+
+def shade(
+    scene: Scene,
+    origin: np.ndarray,
+    direction: np.ndarray,
+    distance: np.ndarray,
+    geom: np.ndarray,
+    normal: np.ndarray,
+    span: Tensor,
+) -> Tensor:
+    """Colours (N, 3) of hits in the world; a miss is sky."""
+    way = torch.from_numpy(direction).float()
+    far = torch.from_numpy(distance).float()
+    across = torch.from_numpy(normal).float()
+    index = torch.from_numpy(geom).long()
+    point = torch.from_numpy(origin).float() + far[:, None] * way
+    slant = (way * across).sum(-1).abs().clamp(min=0.12)
+    rgb = colour(scene.paint, index.clamp(min=0), point, across, far * span / slant)
+    missed = index < 0
+    if bool(missed.any()):
+        rgb[missed] = torch.tensor([0.62, 0.72, 0.82])
+    return rgb

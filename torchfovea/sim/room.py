@@ -1,0 +1,192 @@
+"""Building blocks of a scene: solids with a kind, a room around the robot, and the MuJoCo model they become."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchfovea.head import Head
+from torchfovea.setting import require
+from torchfovea.sim.backend import load_mujoco
+from torchfovea.sim.head_model import add_head
+from torchfovea.sim.texture import Paint
+
+__all__ = ["CAN", "FLOOR", "FURNITURE", "POLE", "ROOM", "TARGET", "Room", "Solid", "can", "compile_scene", "furnish"]
+
+# kinds of geom
+FLOOR, ROOM, FURNITURE, POLE, CAN, TARGET = range(6)
+
+_COKE = (0.76, 0.06, 0.08)
+_FLOOR = ((0.60, 0.50, 0.40), (0.46, 0.38, 0.33))
+_WALLS = (
+    ((0.62, 0.66, 0.60), (0.42, 0.52, 0.52)),
+    ((0.70, 0.60, 0.45), (0.58, 0.42, 0.32)),
+    ((0.55, 0.62, 0.70), (0.44, 0.46, 0.60)),
+    ((0.68, 0.64, 0.58), (0.50, 0.52, 0.44)),
+)
+_FURNITURE = (
+    ((0.72, 0.52, 0.28), (0.50, 0.33, 0.18)),
+    ((0.24, 0.46, 0.50), (0.40, 0.62, 0.56)),
+    ((0.80, 0.66, 0.30), (0.66, 0.44, 0.22)),
+    ((0.36, 0.44, 0.66), (0.52, 0.58, 0.72)),
+    ((0.42, 0.56, 0.34), (0.60, 0.64, 0.40)),
+    ((0.62, 0.40, 0.48), (0.74, 0.58, 0.54)),
+)
+_METAL = (0.40, 0.41, 0.44)
+
+
+@dataclass(frozen=True)
+class Solid:
+    """One geom: `size` are half lengths for a box, (radius, half height) for a cylinder, (radius,) for a sphere [m]."""
+
+    name: str
+    kind: int
+    shape: str
+    position_m: tuple[float, float, float]
+    size_m: tuple[float, ...]
+    yaw_rad: float = 0.0
+    base: tuple[float, float, float] = (0.6, 0.6, 0.6)
+    accent: tuple[float, float, float] = (0.5, 0.5, 0.5)
+    contrast: float = 1.0
+    label: bool = field(default=False)
+
+
+@dataclass(frozen=True)
+class Room:
+    """A closed, textured, furnished room; distances from the world's origin [m].
+
+    Attributes:
+        front_m: to the wall ahead, > 0.
+        back_m: to the wall behind, > 0.
+        side_m: to the walls on either side, > 0.
+        height_m: of the ceiling, > 0.
+        furniture: whether large objects stand along the walls.
+    """
+
+    front_m: float = 4.0
+    back_m: float = 3.0
+    side_m: float = 3.2
+    height_m: float = 2.8
+    furniture: bool = True
+
+    def __post_init__(self) -> None:
+        """Raise SettingError for a room without room."""
+        for name in ("front_m", "back_m", "side_m", "height_m"):
+            value = getattr(self, name)
+            require(1.0 <= value <= 50.0, f"room.{name}", value, "between 1 and 50 metres")
+
+
+def can(
+    name: str, x: float, y: float, bottom_m: float, radius_m: float, height_m: float, target: bool, shade: float = 0.0
+) -> Solid:
+    """A can whose bottom stands at a height above the floor; `shade` varies its red a little."""
+    red = (_COKE[0] + shade, _COKE[1] + shade / 3, _COKE[2] + shade / 3)
+    accent = (red[0] * 0.8, red[1], red[2])
+    place = (x, y, bottom_m + height_m / 2)
+    kind = TARGET if target else CAN
+    return Solid(name, kind, "cylinder", place, (radius_m, height_m / 2), 0.0, red, accent, 0.8, True)
+
+
+def furnish(room: Room, rng: np.random.Generator) -> list[Solid]:
+    """The floor, the walls, the ceiling and the furniture (fixed in place; the generator turns only the colours)."""
+    thick = 0.05
+    middle, half = (room.front_m - room.back_m) / 2, (room.front_m + room.back_m) / 2
+    tall = room.height_m / 2
+    walls = [
+        ("front", (room.front_m + thick, 0.0, tall), (thick, room.side_m + 2 * thick, tall)),
+        ("back", (-room.back_m - thick, 0.0, tall), (thick, room.side_m + 2 * thick, tall)),
+        ("left", (middle, room.side_m + thick, tall), (half, thick, tall)),
+        ("right", (middle, -room.side_m - thick, tall), (half, thick, tall)),
+    ]
+    solids = [Solid("floor", FLOOR, "plane", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 0.0, *_FLOOR)]
+    order = rng.permutation(len(_WALLS))
+    for (name, place, size), k in zip(walls, order, strict=True):
+        solids.append(Solid(f"wall_{name}", ROOM, "box", place, size, 0.0, *_WALLS[k]))
+    lid = (half + 2 * thick, room.side_m + 2 * thick, thick)
+    solids.append(
+        Solid("ceiling", ROOM, "box", (middle, 0.0, room.height_m + thick), lid, 0.0, (0.8, 0.79, 0.76), (0.7,) * 3)
+    )
+    if room.furniture:
+        f, b, s = room.front_m, room.back_m, room.side_m
+        pieces: list[tuple[str, tuple[float, float], tuple[float, ...], float]] = [
+            ("box", (f - 0.6, 0.45 * s), (0.42, 0.42, 0.55), 0.5),
+            ("cylinder", (f - 0.55, -0.15 * s), (0.32, 1.05), 0.0),
+            ("box", (f - 0.7, -0.62 * s), (0.40, 0.55, 0.40), -0.35),
+            ("sphere", (f - 0.9, 0.13 * s), (0.38,), 0.0),
+            ("box", (0.42 * f, s - 0.45), (0.60, 0.30, 0.85), 0.15),
+            ("box", (0.45 * f, -s + 0.5), (0.50, 0.32, 0.60), -0.2),
+            ("cylinder", (0.62 * f, 0.78 * s), (0.26, 0.65), 0.0),
+            ("box", (-b + 0.6, 0.5 * s), (0.40, 0.60, 0.70), 0.25),
+            ("cylinder", (-b + 0.7, -0.5 * s), (0.40, 0.60), 0.0),
+        ]
+        order = rng.permutation(len(pieces)) % len(_FURNITURE)
+        for i, ((shape, (x, y), size, yaw), k) in enumerate(zip(pieces, order, strict=True)):
+            place = (x, y, size[-1])
+            solids.append(Solid(f"furniture_{i}", FURNITURE, shape, place, size, yaw, *_FURNITURE[k]))
+    return solids
+
+
+def pole(name: str, x: float, y: float, top_m: float, radius_m: float) -> Solid:
+    """A thin pole from the floor up to a height."""
+    return Solid(name, POLE, "cylinder", (x, y, top_m / 2), (radius_m, top_m / 2), 0.0, _METAL, (0.3, 0.31, 0.33), 0.7)
+
+
+def compile_scene(solids: list[Solid], head: Head, rng: np.random.Generator) -> tuple[Any, Paint, torch.Tensor]:
+    """The MuJoCo model of solids with a head in it, their paint, and the kind of each geom (G,)."""
+    mujoco = load_mujoco()
+    spec = mujoco.MjSpec()
+    # without these two, software GL is twenty times slower
+    spec.visual.quality.shadowsize = 0
+    spec.visual.quality.offsamples = 0
+    spec.visual.global_.offwidth = spec.visual.global_.offheight = 2048
+    spec.visual.headlight.ambient = [0.5, 0.5, 0.5]
+    spec.visual.headlight.diffuse = [0.3, 0.3, 0.3]
+    spec.visual.headlight.specular = [0, 0, 0]
+    spec.stat.extent = 1.0
+    spec.stat.center = [0, 0, 1]
+    spec.visual.map.znear = 0.02
+    spec.visual.map.zfar = 60.0
+    shapes = {
+        "plane": mujoco.mjtGeom.mjGEOM_PLANE,
+        "box": mujoco.mjtGeom.mjGEOM_BOX,
+        "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+        "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    }
+    for solid in solids:
+        size = list(solid.size_m) + [0.0] * (3 - len(solid.size_m))
+        turn = [math.cos(solid.yaw_rad / 2), 0, 0, math.sin(solid.yaw_rad / 2)]
+        spec.worldbody.add_geom(
+            name=solid.name, type=shapes[solid.shape], size=size, pos=list(solid.position_m), quat=turn,
+            rgba=[*solid.base, 1.0], contype=0, conaffinity=0,
+        )  # fmt: skip
+    add_head(spec, head)
+    model = spec.compile()
+    kinds = torch.tensor([s.kind for s in solids])
+    return model, _paint(solids, rng), kinds
+
+
+def _paint(solids: list[Solid], rng: np.random.Generator) -> Paint:
+    turns = np.linalg.qr(rng.standard_normal((len(solids), 3, 3)))[0]
+    axes = []
+    for solid in solids:
+        c, s = math.cos(solid.yaw_rad), math.sin(solid.yaw_rad)
+        axes.append([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+
+    def tensor(values: Any) -> torch.Tensor:
+        return torch.as_tensor(np.asarray(values), dtype=torch.float32)
+
+    own = tensor(axes)
+    return Paint(
+        rotation=tensor(turns) @ own,
+        centre=tensor([s.position_m for s in solids]),
+        offset=tensor(rng.uniform(0, 20, (len(solids), 3))),
+        base=tensor([s.base for s in solids]),
+        accent=tensor([s.accent for s in solids]),
+        contrast=tensor([s.contrast for s in solids]),
+        axes=own,
+        can=tensor([s.size_m if s.label else (0.0, 0.0) for s in solids]),
+    )

@@ -1,0 +1,169 @@
+"""The simulated world as an agent meets it: it moves its head, gets pictures, and a referee sees the truth."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchfovea.camera import Camera, Pinhole, image_camera
+from torchfovea.head import Gaze, Head, clamp_gaze, cyclopean, eyes, to_ego
+from torchfovea.setting import require
+from torchfovea.sim.model import Scene
+from torchfovea.sim.motor import InstantMotor, Moved
+from torchfovea.sim.rays import Frame, RayHits, cast, render
+
+__all__ = ["Fixated", "Seen", "World"]
+
+
+class Fixated(NamedTuple):
+    """The first surface on the cyclopean ray.
+
+    Attributes:
+        point_e: (3,) in E [m]; far out on the ray for a miss.
+        range_m: its distance from E's origin.
+        geom: which geom it lies on, -1 for a miss.
+        is_floor: whether that is the floor.
+        is_target: whether that is the target.
+    """
+
+    point_e: Tensor
+    range_m: float
+    geom: int
+    is_floor: bool
+    is_target: bool
+
+
+class Seen(NamedTuple):
+    """What the left eye's rays meet, and whether the right eye sees it.
+
+    Attributes:
+        points_e: (N, 3) in E [m]; far out on the ray for a miss.
+        hit: (N,) bool, whether the left ray meets a surface.
+        visible_right: (N,) bool, whether the right eye has a free line of sight to it and it lies before that eye; whether
+            it falls on the right retina is the retina's to say.
+    """
+
+    points_e: Tensor
+    hit: Tensor
+    visible_right: Tensor
+
+
+class World:
+    """A scene with a head in it. Keeps one thing only: where the head looks.
+
+    Args:
+        scene: from `torchfovea.sim.scene.build_scene`; its head is this world's.
+        head: must equal the scene's; the scene's by default.
+        renderer: "rays", or "gl" for OpenGL through MuJoCo.
+        motor: "instant", "physics", or a motor object.
+        camera: of the retinas, in retinal pixels; 90 degrees over 100 px by default.
+        source_px: side of the pictures.
+        radius_px: of the retina, which the pictures span.
+
+    Raises:
+        SettingError: a setting that cannot be.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        head: Head | None = None,
+        renderer: Literal["rays", "gl"] = "rays",
+        motor: Literal["instant", "physics"] | InstantMotor = "instant",
+        camera: Camera | None = None,
+        source_px: int = 400,
+        radius_px: float = 100.0,
+    ) -> None:
+        require(head is None or head == scene.head, "head", head, "the head that the scene was built for")
+        require(renderer in ("rays", "gl"), "renderer", renderer, "rays or gl")
+        require(isinstance(source_px, int) and 2 <= source_px <= 8192, "source_px", source_px, "2 to 8192 pixels")
+        require(radius_px > 0, "radius_px", radius_px, "a positive number of pixels")
+        self.scene = scene
+        self.head = scene.head
+        self.camera = Pinhole.from_fov(90.0, radius_px) if camera is None else camera
+        self.source_px = source_px
+        self.image_camera = image_camera(self.camera, radius_px, source_px)
+        require(motor == "instant" or isinstance(motor, InstantMotor), "motor", motor, "instant")
+        require(renderer == "rays", "renderer", renderer, "rays")
+        self.motor = motor if isinstance(motor, InstantMotor) else InstantMotor()
+        self._render = render
+        zero = torch.zeros((), dtype=torch.float64)
+        self.gaze = Gaze(zero, zero, zero)
+
+    def reset(self) -> None:
+        """Look straight ahead, in no time."""
+        zero = torch.zeros((), dtype=torch.float64)
+        self.gaze = Gaze(zero, zero, zero)
+
+    def saccade(self, gaze: Gaze) -> Moved:
+        """Turn to a gaze, clamped to the head's limits; the executed gaze is `Moved.gaze` and this world's `gaze`.
+
+        Raises:
+            SettingError: a gaze that is not one finite pan, tilt and vergence.
+        """
+        command = clamp_gaze(self.head, self._one(gaze))
+        moved = self.motor.move(self.head, self.gaze, command)
+        self.gaze = moved.gaze
+        return moved
+
+    def images(self, gaze: Gaze | None = None) -> tuple[Frame, Frame]:
+        """Left and right pictures at a gaze (the current one by default)."""
+        pose = eyes(self.head, self._one(gaze))
+        return tuple(
+            self._render(self.scene, r, t, self.image_camera, self.source_px)
+            for r, t in ((pose.R_left, pose.t_left), (pose.R_right, pose.t_right))
+        )
+
+    def fixated(self, gaze: Gaze | None = None) -> Fixated:
+        """The truth about a gaze (the current one by default): the first surface on the cyclopean ray."""
+        rotation, origin = cyclopean(self.head, self._one(gaze))
+        axis = rotation[:, 2]
+        hits = cast(self.scene, origin, axis[None])
+        point = origin + hits.range_m[0] * axis
+        geom = hits.geom
+        return Fixated(
+            point,
+            float(point.norm()),
+            int(geom[0]),
+            bool(self.scene.is_floor(geom)[0]),
+            bool(self.scene.is_target(geom)[0]),
+        )
+
+    def panorama(self, directions_e: Tensor) -> RayHits:
+        """The truth about directions (N, 3) from E's origin."""
+        return cast(self.scene, torch.zeros(3, dtype=torch.float64), directions_e)
+
+    def correspond(self, left_directions: Tensor, gaze: Gaze | None = None) -> Seen:
+        """What the left eye's rays meet, and whether the right eye sees the same points: a sensor without pictures.
+
+        Args:
+            left_directions: (N, 3) in the left camera's frame, of any positive length.
+            gaze: the current one by default.
+
+        Returns:
+            In the directions' dtype; computed in float64.
+        """
+        pose = eyes(self.head, self._one(gaze))
+        direction = to_ego(pose.R_left, torch.nn.functional.normalize(left_directions.double(), dim=-1))
+        hits = cast(self.scene, pose.t_left, direction)
+        point = pose.t_left + hits.range_m[:, None] * direction
+        line = point - pose.t_right
+        away = line.norm(dim=-1)
+        back = cast(self.scene, pose.t_right, line)
+        hit = hits.geom >= 0
+        # the right eye's own first hit is the point itself, but for rounding at grazing incidence
+        free = back.range_m >= away - (1e-5 + 1e-5 * away)
+        ahead = (line * pose.R_right[:, 2]).sum(-1) > 0
+        return Seen(point.to(left_directions.dtype), hit, hit & free & ahead)
+
+    def _one(self, gaze: Gaze | None) -> Gaze:
+        if gaze is None:
+            return self.gaze
+        values = [torch.as_tensor(a).detach().to("cpu", torch.float64) for a in gaze]
+        for name, value in zip(Gaze._fields, values, strict=True):
+            require(
+                value.numel() == 1 and bool(torch.isfinite(value).all()), f"gaze.{name}", value.tolist(), "one angle"
+            )
+        return Gaze(*(v.reshape(()) for v in values))
