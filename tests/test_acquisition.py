@@ -2,7 +2,6 @@
 
 import inspect
 import math
-import time
 
 import mpmath
 import numpy as np
@@ -13,6 +12,7 @@ from hypothesis import strategies as st
 from scipy import integrate, stats
 
 from torchfovea import acquisition as aq
+from torchfovea import policies as po
 from torchfovea.setting import SettingError
 
 mpmath.mp.dps = 60
@@ -214,9 +214,9 @@ def test_one_generator_a_row_equals_one_by_one():
     def row(m, s, e, g):
         return (
             aq.thompson(m, s, g),
-            aq.random_scores(m, g),
+            po.random_scores(m, g),
             aq.choose(m.round(), e, g),
-            *aq.hedge_choose(aq.Hedge(m[..., :4]), torch.arange(4).expand_as(m[..., :4]), 1.0, g),
+            *po.hedge_choose(po.Hedge(m[..., :4]), torch.arange(4).expand_as(m[..., :4]), 1.0, g),
         )
 
     together = row(mean, std, eligible, [generator(i) for i in range(6)])
@@ -244,177 +244,6 @@ def test_ties_among_thousands_are_uniform():
     picks = aq.choose(torch.zeros(3000, 2000), torch.ones(2000, dtype=torch.bool), generator())
     counts = np.bincount(picks.numpy() // 100, minlength=20)
     assert stats.chisquare(counts).pvalue > 1e-4
-
-
-# --- infomax ---------------------------------------------------------------------------------------------------------
-
-
-def sphere(n, seed=0, dtype=torch.float64):
-    return torch.nn.functional.normalize(torch.randn(n, 3, generator=generator(seed), dtype=dtype), dim=-1)
-
-
-def test_information_gain_is_the_entropy_a_measurement_removes(monkeypatch):
-    monkeypatch.setattr(aq, "_BLOCK", 40)
-    g = generator()
-    variance = torch.rand(2, 9, generator=g, dtype=torch.float64)
-    precision = torch.rand(2, 7, 9, generator=g, dtype=torch.float64) * 10
-    precision[0, 2, 3] = 0
-    eligible = torch.rand(2, 9, generator=g) > 0.3
-    gain = aq.information_gain(variance, precision, eligible)
-    for b in range(2):
-        for i in range(7):
-            total = 0.0
-            for j in range(9):
-                if eligible[b, j]:
-                    posterior = 1 / (1 / variance[b, j].item() + precision[b, i, j].item())
-                    total += stats.norm.entropy(scale=variance[b, j].item() ** 0.5)
-                    total -= stats.norm.entropy(scale=posterior**0.5)
-            assert gain[b, i].item() == pytest.approx(total, abs=1e-12)
-    shared = aq.information_gain(variance, precision[1], eligible)
-    torch.testing.assert_close(shared[1], gain[1])
-    alone = aq.information_gain(variance[0], precision[0])
-    torch.testing.assert_close(alone, aq.information_gain(variance, precision)[0])
-    v, p = variance.clone().requires_grad_(), precision.clone().requires_grad_()
-    assert torch.autograd.gradcheck(aq.information_gain, (v, p))
-
-
-@dtypes
-def test_gaze_information_gain(dtype):
-    cells, candidates = sphere(30, dtype=dtype), sphere(11, 1, dtype)
-    candidates = torch.cat([candidates, cells[:1], -cells[:1]])
-    variance = torch.rand(4, 30, generator=generator(), dtype=dtype)
-    law = aq.eccentricity_law(0.01, 0.3)
-    precision = aq.precision_by_eccentricity(candidates, cells, law, 0.8)
-    for i, c in enumerate(candidates.double().numpy()):
-        for j, x in enumerate(cells.double().numpy()):
-            angle = math.atan2(np.linalg.norm(np.cross(c, x)), c @ x)
-            expected = 1 / (0.01**2 + (0.3 * angle) ** 2) if angle <= 0.8 else 0.0
-            assert precision[i, j].item() == pytest.approx(expected, rel=1e-4 if dtype == torch.float32 else 1e-9)
-    gain = aq.gaze_information_gain(variance, candidates, cells, law, 0.8)
-    torch.testing.assert_close(gain, aq.information_gain(variance, precision))
-    v, c = variance.clone().requires_grad_(), candidates.clone().requires_grad_()
-    gradients = torch.autograd.grad(aq.gaze_information_gain(v, c, cells, law).sum(), (v, c))
-    assert all(torch.isfinite(g).all() for g in gradients)
-
-
-def test_a_fovea_looks_where_it_knows_least():
-    cells = sphere(400)
-    variance = torch.full((400,), 1e-4, dtype=torch.float64)
-    variance[(cells @ cells[17]) > 0.95] = 1.0
-    gain = aq.gaze_information_gain(variance, cells, cells, aq.eccentricity_law(0.01, 1.0), 0.7)
-    assert cells[gain.argmax()] @ cells[17] > 0.95
-    assert gain[17] > 5 * gain[(cells @ cells[17]).argmin()]
-
-
-def test_information_gain_of_two_thousand_by_two_thousand_is_cheap():
-    cells = sphere(2000, dtype=torch.float32)
-    start = time.perf_counter()
-    aq.gaze_information_gain(torch.rand(2000), cells, cells, aq.eccentricity_law(0.01, 0.3), 0.8)
-    assert time.perf_counter() - start < 5  # tens of milliseconds on an idle machine
-
-
-@pytest.mark.parametrize("sigma", [(0.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (math.nan, 1.0), (1.0, math.inf)])
-def test_eccentricity_law_refuses(sigma):
-    with pytest.raises(SettingError, match="sigma_"):
-        aq.eccentricity_law(*sigma)
-
-
-# --- costs, portfolio, baselines -------------------------------------------------------------------------------------
-
-
-def test_costs():
-    forward = torch.tensor([2.0, 0.0, 0.0], dtype=torch.float64, requires_grad=True)
-    directions = torch.tensor([[1.0, 0, 0], [0, 3.0, 0], [-1.0, 0, 0], [1.0, 1.0, 0]]).double().requires_grad_()
-    degrees = aq.saccade_degrees(forward, directions)
-    assert degrees.tolist() == pytest.approx([0, 90, 180, 45])
-    assert all(torch.isfinite(g).all() for g in torch.autograd.grad(degrees.sum(), (forward, directions)))
-    assert aq.saccade_degrees(forward.expand(5, 3), directions).shape == (5, 4)
-    assert aq.saccade_seconds(degrees).tolist() == pytest.approx([0, 0.219, 0.417, 0.12])
-    score = torch.tensor([1.0, 2.0, 4.0, 8.0], dtype=torch.float64)
-    assert aq.per_cost(score, degrees, 10.0).tolist() == pytest.approx([0.1, 0.02, 4 / 190, 8 / 55])
-    assert aq.minus_cost(score, degrees, 0.1).tolist() == pytest.approx([1, -7, -14, 3.5])
-    both = aq.minus_cost(score.expand(2, 4), degrees, torch.tensor([0.0, 0.1]))
-    torch.testing.assert_close(both, torch.stack([score, score - torch.tensor(0.1).double() * degrees]))
-    with pytest.raises(SettingError, match="overhead"):
-        aq.per_cost(score, degrees, 0.0)
-
-
-def test_saccade_degrees_gradcheck():
-    direction, directions = sphere(2, 3).requires_grad_(), sphere(8, 4).reshape(2, 4, 3).clone().requires_grad_()
-    assert torch.autograd.gradcheck(aq.saccade_degrees, (direction, directions))
-
-
-def test_hedge_follows_the_probabilities_and_learns():
-    state = aq.Hedge(torch.tensor([0.0, math.log(2.0), math.log(5.0)]).expand(20000, 3))
-    nominees = torch.tensor([7, 8, 9]).expand(20000, 3)
-    cell, followed = aq.hedge_choose(state, nominees, 1.0, generator())
-    assert torch.equal(cell, followed + 7)
-    assert (torch.bincount(followed) / 20000).tolist() == pytest.approx([1 / 8, 2 / 8, 5 / 8], abs=0.015)
-
-    mean = torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)
-    state, good = aq.hedge_start((), 3, mean), 0
-    for g in map(generator, range(200)):
-        nominees = torch.tensor([0, 2, -1])
-        _, followed = aq.hedge_choose(state, nominees, math.sqrt(8 * math.log(3) / 200), g)
-        good += int(followed == 1)
-        state = aq.hedge_update(state, nominees, mean)
-    assert state.gains.tolist() == [0, 200, 0]
-    assert good > 170
-    assert aq.hedge_start((2, 5), 3, mean).gains.shape == (2, 5, 3)
-    with pytest.raises(SettingError, match=r"acquisition\.eta"):
-        aq.hedge_choose(state, nominees, -1.0, generator())
-
-
-def test_hedge_update_is_a_loop():
-    mean, _ = belief(2, 6)
-    nominees = torch.tensor([[0, 5, 5], [3, -1, 2]])
-    gains = aq.hedge_update(aq.hedge_start((2,), 3, mean), nominees, mean).gains
-    expected = [[mean[b, c].item() if c >= 0 else 0.0 for c in row] for b, row in enumerate(nominees.tolist())]
-    assert gains.tolist() == expected
-
-
-def test_raster_visits_row_by_row_and_cycles():
-    pan, tilt = torch.meshgrid(torch.linspace(-50, 50, 41), torch.linspace(-36, 18, 23), indexing="ij")
-    pan, tilt = torch.deg2rad(pan.flatten()), torch.deg2rad(tilt.flatten())
-    cells = torch.stack([tilt.cos() * pan.cos(), tilt.cos() * pan.sin(), tilt.sin()], -1).double()
-    ranks = aq.raster_ranks(cells, 20.0)
-    order = ranks.argsort()[-int((ranks >= 0).sum()) :]
-    assert ranks[order].tolist() == list(range(len(order)))
-    steps = aq.saccade_degrees(cells[order][:-1], cells[order][1:, None])[:, 0]
-    assert steps.max() < 32 and steps.mean() > 12
-    assert (cells @ cells[order].T).max(1).values.min() > math.cos(math.radians(16))
-    assert tilt[order[0]] > tilt[order[-1]]
-    eligible = torch.ones(len(cells), dtype=torch.bool)
-    last, seen = torch.tensor(-1), []
-    for _ in range(len(order) + 1):
-        last = aq.choose(aq.raster_scores(ranks, last), eligible, generator())
-        seen.append(last.item())
-    assert seen == [*order.tolist(), order[0].item()]
-    eligible[order[1]] = False
-    assert aq.choose(aq.raster_scores(ranks, order[0]), eligible) == order[2]
-    batch = aq.raster_scores(ranks, order[:2])
-    assert torch.equal(batch[1], aq.raster_scores(ranks, order[1]))
-    off = int((ranks < 0).nonzero()[0])
-    assert aq.choose(aq.raster_scores(ranks, torch.tensor(-1)), torch.arange(len(cells)) == off) == off
-    assert aq.choose(aq.raster_scores(ranks, torch.tensor(off)), ranks >= 0) == order[0]
-    for bad in (0.0, -3.0, 180.0, math.nan):
-        with pytest.raises(SettingError, match="spacing_deg"):
-            aq.raster_ranks(cells, bad)
-
-
-def test_random_first_glance_and_oracle():
-    mean, _ = belief(3, 50)
-    everything = torch.ones(50, dtype=torch.bool)
-    picks = [aq.choose(aq.random_scores(mean, generator(i)), everything, generator(i))[0].item() for i in range(300)]
-    assert len(set(picks)) == 50 or len(set(picks)) > 45
-    chosen = aq.choose(aq.first_glance_scores(mean, torch.full((3,), -1)), everything, generator())
-    assert torch.equal(chosen, mean.argmax(-1))
-    later, _ = belief(3, 50, seed=1)
-    assert torch.equal(aq.choose(aq.first_glance_scores(later, chosen), everything, generator()), chosen)
-    cells = sphere(50)
-    best = sphere(3, 9)
-    expected = [max(range(50), key=lambda j, b=b: float(cells[j] @ b)) for b in best]
-    assert aq.oracle_scores(cells, best).argmax(-1).tolist() == expected
 
 
 def test_best_of():

@@ -18,7 +18,10 @@ FLOORS = (
     ("setting", "files"),
     ("gaussian",),
     ("camera", "layout", "retina", "head", "unscented", "chart", "sphere", "nearest"),
-    ("matching", "geometric", "triangulation", "egosphere", "acquisition", "reward", "metrics"),
+    (
+        *("matching", "geometric", "triangulation", "egosphere"),
+        *("acquisition", "infomax", "policies", "reward", "metrics", "significance"),
+    ),
     ("perception",),
     ("tuning", "episode"),
     ("sim",),
