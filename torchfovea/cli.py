@@ -29,6 +29,11 @@ class Command(NamedTuple):
 # A command NAME is a function of its composed configuration conf/NAME.yaml; what it returns is the score that
 # Hydra's sweepers see.
 COMMANDS: dict[str, Command] = {
+    "search": Command(
+        "torchfovea.experiments.search:run",
+        "find the nearest object by saccades, and map the scene: the main job",
+        "torchfovea search scene=cans sensor=uniform acquisition.alpha=2",
+    ),
     "doctor": Command("torchfovea.doctor:run", "what this machine can render and has", "torchfovea doctor"),
 }
 

@@ -1,0 +1,186 @@
+"""Triangulation and the transform through it: SciPy least squares, kornia, Monte Carlo, and laws of both charts."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from kornia.geometry.epipolar import triangulate_points
+from scipy.optimize import least_squares
+
+from torchfovea.camera import Fisheye, Pinhole
+from torchfovea.chart import cartesian_from_inverse_range, inverse_range_coordinates
+from torchfovea.gaussian import Gaussian, unpack
+from torchfovea.head import Eyes, Gaze, Head, eyes, fixate, to_ego
+from torchfovea.correspondence import Correspondences
+from torchfovea.setting import SettingError
+from torchfovea.triangulation import observe, sigma_root, triangulate, triangulate_homogeneous
+from torchfovea.unscented import SigmaPoints
+
+HEAD = Head()
+CAMERA = Pinhole.from_fov(90, 100)
+HALF = torch.tensor(0.5)
+
+
+def stereo(points: torch.Tensor, sigma: float, gaze: Gaze | None = None, camera=CAMERA) -> tuple[Correspondences, Eyes]:
+    """Exact correspondences of points (N, 3) in E."""
+    zero = torch.zeros((), dtype=points.dtype)
+    pose = eyes(HEAD, gaze or Gaze(zero, zero, zero + 0.1))
+    left = camera.project(to_ego(pose.R_left.mT, points - pose.t_left))
+    right = camera.project(to_ego(pose.R_right.mT, points - pose.t_right))
+    spread = torch.full(points.shape[:-1], sigma, dtype=points.dtype)
+    return Correspondences(left, right, spread, spread, torch.ones(points.shape[:-1], dtype=torch.bool)), pose
+
+
+def cloud(count: int, seed: int, dtype: torch.dtype = torch.float64, nearest: float = 0.5, farthest: float = 4.0) -> torch.Tensor:
+    rng = torch.Generator().manual_seed(seed)
+    u = torch.rand(count, 3, generator=rng, dtype=torch.float64)
+    x = nearest + (farthest - nearest) * u[:, 0]
+    return torch.stack([x, (u[:, 1] - 0.5) * x, (u[:, 2] - 0.5) * x], -1).to(dtype)
+
+
+@given(seed=st.integers(0, 1000))
+def test_exact_rays_meet_at_the_point_in_both_forms(seed):
+    points = cloud(20, seed)
+    matches, pose = stereo(points, 0.1)
+    left, right = to_ego(pose.R_left, CAMERA.rays(matches.left_px)), to_ego(pose.R_right, CAMERA.rays(matches.right_px))
+    midpoint, front = triangulate(left, right, pose.t_left, pose.t_right)
+    x, w, ahead = triangulate_homogeneous(left, right, pose.t_left, pose.t_right)
+    assert bool(front.all() and ahead.all())
+    torch.testing.assert_close(midpoint, points, rtol=1e-8, atol=1e-9)
+    torch.testing.assert_close(x / w[..., None], points, rtol=1e-8, atol=1e-9)
+
+
+def test_skew_rays_midpoint_is_the_least_squares_point():
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        tl, tr = rng.normal(size=(2, 3)) * 0.1
+        point = np.array([0, 0, 2.0]) + rng.normal(size=3) * 0.3
+        dl, dr = point - tl + rng.normal(size=3) * 0.01, point - tr + rng.normal(size=3) * 0.01
+
+        def residual(p, tl=tl, tr=tr, dl=dl, dr=dr):
+            return np.concatenate([np.cross(p - t, d / np.linalg.norm(d)) for t, d in ((tl, dl), (tr, dr))])
+
+        got, front = triangulate(*(torch.from_numpy(v) for v in (dl, dr, tl, tr)))
+        # the point nearest to both lines is the middle of their common perpendicular
+        best = least_squares(residual, point, xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+        assert front.item()
+        np.testing.assert_allclose(got, best, atol=1e-6)
+
+
+def test_agrees_with_kornia_on_exact_matches():
+    points = cloud(30, 3)
+    matches, pose = stereo(points, 0.1)
+    k = torch.diag(torch.tensor([CAMERA.focal_px, CAMERA.focal_px, 1.0], dtype=torch.float64))
+    projections = [k @ torch.cat([r.mT, -(r.mT @ t)[:, None]], -1) for r, t in ((pose.R_left, pose.t_left), (pose.R_right, pose.t_right))]
+    peer = triangulate_points(projections[0][None], projections[1][None], matches.left_px[None], matches.right_px[None])[0]
+    observed = observe(matches, pose, CAMERA, HALF, SigmaPoints(), "cartesian")
+    torch.testing.assert_close(observed.mean, peer, rtol=2e-2, atol=2e-3)  # the UT's mean adds the curvature of 1/D
+
+
+def test_parallel_and_diverging_rays_are_masked_or_beyond_infinity():
+    left = torch.tensor([[0.0, 0, 1], [-0.1, 0, 1], [0.1, 0, 1]], dtype=torch.float64, requires_grad=True)
+    right = torch.tensor([[0.0, 0, 1], [0.1, 0, 1], [-0.1, 0, 1]], dtype=torch.float64)
+    tl, tr = torch.tensor([-0.1, 0, 0], dtype=torch.float64), torch.tensor([0.1, 0, 0], dtype=torch.float64)
+    point, front = triangulate(left, right, tl, tr)
+    assert front.tolist() == [False, False, True] and bool(torch.isfinite(point).all())
+    x, w, ahead = triangulate_homogeneous(left, right, tl, tr)
+    assert ahead.all() and w[0].item() == 0 and w[1] < 0 < w[2] and bool((x[..., 2] > 0).all())
+    (point.sum() + x.sum() + w.sum()).backward()
+    assert bool(torch.isfinite(left.grad).all())
+
+
+@given(left=st.floats(0.01, 3), right=st.floats(0.01, 3))
+def test_both_roots_are_roots(left, right):
+    sl, sr = torch.tensor(left, dtype=torch.float64), torch.tensor(right, dtype=torch.float64)
+    for rotated in (False, True):
+        root = sigma_root(sl, sr, rotated)
+        want = torch.diag(torch.stack([sl, sl, sr, sr]) ** 2)
+        torch.testing.assert_close(root @ root.mT, want, rtol=1e-9, atol=1e-12)
+    version = sigma_root(sl, sr)[:, 1]
+    assert version[0] == version[2]  # moves both eyes alike
+
+
+@pytest.mark.parametrize("chart", ["inverse_range", "cartesian"])
+@pytest.mark.parametrize("camera", [CAMERA, Fisheye.from_fov(120, 100)])
+def test_moments_match_monte_carlo(chart, camera):
+    """400,000 samples; disparity noise over disparity is below 5% here."""
+    points = torch.tensor([[1.0, 0.2, -0.1], [0.7, -0.3, 0.1]], dtype=torch.float64)
+    matches, pose = stereo(points, 0.3, camera=camera)
+    observed = observe(matches, pose, camera, HALF, chart=chart)
+    rng = torch.Generator().manual_seed(0)
+    noise = 0.3 * torch.randn(400_000, 2, 4, generator=rng, dtype=torch.float64)
+    left = to_ego(pose.R_left, camera.rays(matches.left_px + noise[..., :2]))
+    right = to_ego(pose.R_right, camera.rays(matches.right_px + noise[..., 2:]))
+    sample, front = triangulate(left, right, pose.t_left, pose.t_right)
+    assert bool(front.all())
+    if chart == "inverse_range":
+        x, w, _ = triangulate_homogeneous(left, right, pose.t_left, pose.t_right)
+        sample = inverse_range_coordinates(x, w, observed.direction)
+    for i in range(2):
+        want = np.cov(sample[:, i].numpy().T)
+        scale = np.sqrt(np.outer(np.diag(want), np.diag(want)))
+        np.testing.assert_allclose((unpack(observed.cov[i]).numpy() - want) / scale, 0, atol=0.02)
+        np.testing.assert_allclose((observed.mean[i].numpy() - sample[:, i].mean(0).numpy()) / np.sqrt(np.diag(want)), 0, atol=0.02)
+
+
+def test_charts_agree_to_first_order():
+    matches, pose = stereo(cloud(50, 5, farthest=1.5), 0.02)
+    inverse = observe(matches, pose, CAMERA, HALF)
+    cartesian = observe(matches, pose, CAMERA, HALF, chart="cartesian")
+    converted = cartesian_from_inverse_range(Gaussian(inverse.mean, inverse.cov), inverse.direction)
+    torch.testing.assert_close(converted.mean, cartesian.mean, rtol=1e-3, atol=1e-4)
+    relative = (converted.cov - cartesian.cov).norm(dim=-1) / cartesian.cov.norm(dim=-1)
+    assert relative.max() < 0.01
+
+
+def test_infinity_is_an_ordinary_place_in_inverse_range_only():
+    far = torch.tensor([[1e7, 0.0, 0.1e7]], dtype=torch.float64)
+    matches, pose = stereo(far, 0.2)
+    inverse, cartesian = (observe(matches, pose, CAMERA, HALF, chart=c) for c in ("inverse_range", "cartesian"))
+    assert inverse.valid.item() and not cartesian.valid.item()
+    # σ of 1/r: disparity noise √2 0.2 px over f b
+    assert inverse.cov[0, 5].sqrt().item() == pytest.approx(0.2 * math.sqrt(2) / CAMERA.focal_px / HEAD.baseline_m, rel=0.05)
+
+
+def test_invalid_is_finite_and_float32_is_float64():
+    matches, pose = stereo(cloud(40, 2), 0.1)
+    broken = matches._replace(valid=torch.arange(40) % 2 == 0, right_sigma_px=torch.where(torch.arange(40) == 4, 0.0, matches.right_sigma_px))
+    observed = observe(broken, pose, CAMERA, HALF)
+    assert observed.valid.sum() == 19 and all(bool(torch.isfinite(x).all()) for x in observed)
+    single = observe(Correspondences(*(x.float() if x.is_floating_point() else x for x in matches)), Eyes(*(x.float() for x in pose)), CAMERA, HALF)
+    double = observe(matches, pose, CAMERA, HALF)
+    assert single.mean.dtype == torch.float32
+    torch.testing.assert_close(single.mean.double(), double.mean, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(single.cov.double(), double.cov, rtol=1e-2, atol=1e-9)
+
+
+def test_batch_is_loop():
+    points = cloud(6, 9)
+    gazes = fixate(HEAD, points[:2])[0]
+    many = [stereo(points, 0.1, Gaze(*(g[i] for g in gazes))) for i in range(2)]
+    matches = Correspondences(*(torch.stack(pair) for pair in zip(*(m for m, _ in many), strict=True)))
+    whole = observe(matches, eyes(HEAD, gazes), CAMERA, HALF)
+    for i, (m, pose) in enumerate(many):
+        for a, b in zip(whole, observe(m, pose, CAMERA, HALF), strict=True):
+            torch.testing.assert_close(a[i], b)
+
+
+@pytest.mark.parametrize("chart", ["inverse_range", "cartesian"])
+def test_gradients(chart):
+    matches, pose = stereo(cloud(3, 1, farthest=1.5), 0.1)
+
+    def through(left, right, sigma):
+        o = observe(matches._replace(left_px=left, right_px=right, left_sigma_px=sigma), pose, CAMERA, HALF, chart=chart)
+        return o.mean, o.cov
+
+    inputs = (matches.left_px, matches.right_px, matches.left_sigma_px)
+    assert torch.autograd.gradcheck(through, tuple(x.detach().clone().contiguous().requires_grad_() for x in inputs))
+
+
+def test_unknown_chart_is_an_error():
+    matches, pose = stereo(cloud(1, 0), 0.1)
+    with pytest.raises(SettingError, match="chart = polar"):
+        observe(matches, pose, CAMERA, HALF, chart="polar")

@@ -1,0 +1,202 @@
+"""From a composed configuration to the library's dataclasses, with every value checked under the name the user knows."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+from typing import Any, TypeVar
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+
+from torchfovea import acquisition, sphere
+from torchfovea.camera import Camera, Fisheye, Pinhole
+from torchfovea.egosphere import Fusion, Prior
+from torchfovea.head import Head, fixate
+from torchfovea.layout import LogPolar, Retina, Uniform
+from torchfovea.correspondence import Budget
+from torchfovea.perception import Acquisition, Eligibility, Observer
+from torchfovea.sgbm import SGBM
+from torchfovea.setting import SettingError, require
+from torchfovea.sim.arena import Arena
+from torchfovea.sim.scene import AttentionWorld, Cans, Room, build_scene
+from torchfovea.sim.world import World
+from torchfovea.unscented import SigmaPoints
+
+__all__ = [
+    "build_acquisition",
+    "build_arena",
+    "build_cells",
+    "build_observer",
+    "build_sensor",
+    "choice",
+    "construct",
+    "number",
+    "whole",
+]
+
+T = TypeVar("T")
+
+# A direction counts as reachable if its point at this range is: the neck turns about E, the eyes sit beside it.
+REACH_RANGE_M = 1.0
+
+
+def construct(kind: type[T], node: DictConfig | dict[str, Any], where: str) -> T:
+    """Build a dataclass from the settings of the same names; others are ignored.
+
+    Args:
+        kind: a frozen dataclass whose fields are floats, ints, bools and strings.
+        node: the settings.
+        where: their group's name, for errors.
+
+    Raises:
+        SettingError: for a value of another type, and whatever the dataclass itself refuses.
+    """
+    values = {}
+    for field in dataclasses.fields(kind):  # type: ignore[arg-type]
+        if field.name in node:
+            values[field.name] = _typed(node[field.name], str(field.type), f"{where}.{field.name}")
+    return kind(**values)
+
+
+def _typed(value: Any, kind: str, setting: str) -> Any:
+    """A value of a dataclass field's type, told by its name; `Range` is a pair of numbers."""
+    if kind.endswith("| None"):
+        return None if value is None else _typed(value, kind.removesuffix("| None").strip(), setting)
+    if kind == "Range":
+        pair = not isinstance(value, str) and hasattr(value, "__len__") and len(value) == 2
+        require(pair, setting, value, "two numbers, [least, most]")
+        return tuple(_typed(v, "float", setting) for v in value)
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if kind == "float":
+        require(number, setting, value, "a number")
+        return float(value)
+    if kind == "int":
+        require(number and float(value).is_integer(), setting, value, "a whole number")
+        return int(value)
+    require(kind not in ("bool", "str") or type(value).__name__ == kind, setting, value, {"bool": "true or false"}.get(kind, "a word"))
+    return value
+
+
+def choice(cfg: DictConfig, setting: str, options: tuple[str, ...]) -> str:
+    """One of several words, read at a dotted name."""
+    value = OmegaConf.select(cfg, setting)
+    require(value in options, setting, value, "one of " + ", ".join(options))
+    return str(value)
+
+
+def whole(cfg: DictConfig, setting: str, least: int = 1) -> int:
+    """A whole number no smaller than `least`, read at a dotted name."""
+    value = _typed(OmegaConf.select(cfg, setting), "int", setting)
+    require(value >= least, setting, value, f"at least {least}")
+    return int(value)
+
+
+def number(cfg: DictConfig, setting: str) -> float:
+    """A positive number, read at a dotted name."""
+    value = _typed(OmegaConf.select(cfg, setting), "float", setting)
+    require(value > 0, setting, value, "a positive number")
+    return float(value)
+
+
+def build_sensor(cfg: DictConfig) -> tuple[Camera, Retina]:
+    """The eyes' camera, in retinal pixels, and their retina."""
+    layout = choice(cfg, "sensor.layout", ("log_polar", "uniform"))
+    kind = choice(cfg, "sensor.camera", ("pinhole", "fisheye"))
+    fov_deg = _typed(cfg.sensor.fov_deg, "float", "sensor.fov_deg")
+    widest = 180 if kind == "pinhole" else 360
+    require(0 < fov_deg < widest, "sensor.fov_deg", fov_deg, f"more than 0 and less than {widest} for a {kind} camera")
+    retina = construct(LogPolar if layout == "log_polar" else Uniform, cfg.sensor, "sensor")
+    return (Pinhole if kind == "pinhole" else Fisheye).from_fov(fov_deg, retina.radius_px), retina
+
+
+def build_acquisition(cfg: DictConfig) -> Acquisition:
+    """The acquisition function by its name."""
+    name = choice(cfg, "acquisition.name", ("ucb", "pi", "ei", "log_ei"))
+    if name != "ucb":
+        full = {"pi": "log_probability_of_improvement", "ei": "expected_improvement", "log_ei": "log_expected_improvement"}
+        return getattr(acquisition, full[name])  # type: ignore[no-any-return]
+    alpha = _typed(cfg.acquisition.alpha, "float", "acquisition.alpha")
+    require(alpha >= 0, "acquisition.alpha", alpha, "a number not below 0; inf is allowed")
+    return partial(_bound, alpha=alpha)
+
+
+def _bound(mean: Tensor, std: Tensor, incumbent: Tensor, alpha: float) -> Tensor:
+    return acquisition.upper_confidence_bound(mean, std, alpha)
+
+
+def build_observer(cfg: DictConfig) -> Observer:
+    """The observer that a configuration describes."""
+    camera, retina = build_sensor(cfg)
+    printed = choice(cfg, "budget.sigma_points", ("ours", "paper")) == "paper"
+    return Observer(
+        head=construct(Head, cfg.head, "head"),
+        camera=camera,
+        retina=retina,
+        budget=construct(Budget, {**cfg.budget, "source_px": whole(cfg, "sensor.source_px", 16) if cfg.budget.source else None}, "budget"),
+        points=SigmaPoints.paper() if printed else SigmaPoints(),
+        rotated=not printed,
+        fusion=construct(Fusion, cfg.fusion, "fusion"),
+        prior=construct(Prior, cfg.prior, "prior"),
+        reward=choice(cfg, "reward.name", ("inverse_range", "range")),
+        acquisition=build_acquisition(cfg),
+        eligibility=construct(Eligibility, cfg.eligibility, "eligibility"),
+    )
+
+
+def build_cells(cfg: DictConfig, head: Head, generator: torch.Generator, dtype: torch.dtype = torch.float32) -> Tensor:
+    """The memory's directions, restricted to what the head can fixate, (cells, 3).
+
+    Raises:
+        SettingError: for no cells, a bad mixture or one that never falls within reach.
+    """
+    count = whole(cfg, "memory.cells")
+    memory = OmegaConf.to_container(cfg.memory, resolve=True)
+    assert isinstance(memory, dict)
+
+    def reachable(directions: Tensor) -> Tensor:
+        return fixate(head, REACH_RANGE_M * directions)[1]
+
+    if memory.get("topology"):
+        topologies = {
+            "latitude_longitude": sphere.latitude_longitude_directions,
+            "geodesic": sphere.geodesic_directions,
+            "truncated_icosahedron": sphere.truncated_icosahedron_directions,
+            "fibonacci": sphere.fibonacci_directions,
+        }
+        name = memory["topology"]
+        require(name in topologies, "memory.topology", name, "one of " + ", ".join(topologies))
+        return sphere.reachable_directions(topologies[name], count, reachable).to(dtype)
+    missing = [key for key in ("weights", "means", "covariances") if key not in memory]
+    if missing:
+        raise SettingError(f"memory.{missing[0]} = missing: expected a mixture's weights, means and covariances")
+    mixture = sphere.direction_mixture(memory["weights"], memory["means"], memory["covariances"], dtype=torch.float64)
+    return sphere.sample(mixture, count, generator, reachable).to(dtype)
+
+
+
+
+def build_arena(cfg: DictConfig, observer: Observer, seed: int) -> Arena:
+    """The simulated world of an episode."""
+    kind = {"attention_world": AttentionWorld, "cans": Cans}[choice(cfg, "scene.name", ("attention_world", "cans"))]
+    room = construct(Room, cfg.scene.room, "scene.room") if "room" in cfg.scene else Room()
+    fields = {key: value for key, value in cfg.scene.items() if key not in ("name", "room")}
+    params = construct(kind, {**fields, "room": room}, "scene")
+    scene = build_scene(params, seed, observer.head)
+    fidelity = choice(cfg, "fidelity", ("photometric", "geometric"))
+    world = World(
+        scene,
+        renderer=choice(cfg, "renderer.name", ("rays", "gl")),
+        motor=choice(cfg, "motor", ("instant", "physics")),
+        camera=observer.camera,
+        source_px=whole(cfg, "sensor.source_px", 16),
+        radius_px=observer.retina.radius_px,
+    )
+    return Arena(world, observer, None if fidelity == "geometric" else build_matcher(cfg))
+
+
+def build_matcher(cfg: DictConfig) -> tuple[SGBM, float]:
+    """The stereo matcher's parameters and the nearest range that it searches."""
+    choice(cfg, "matcher.name", ("sgbm",))
+    return construct(SGBM, cfg.matcher, "matcher"), number(cfg, "matcher.nearest_range_m")

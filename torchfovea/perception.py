@@ -1,0 +1,190 @@
+"""One step of the observer: correspondences and a memory in, a new memory and the next fixation out. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchfovea.acquisition import choose, upper_confidence_bound
+from torchfovea.camera import Camera, Pinhole
+from torchfovea.chart import cartesian_from_inverse_range
+from torchfovea.egosphere import EgoSphere, Fusion, Prior, belief, new_egosphere, remember
+from torchfovea.gaussian import Gaussian
+from torchfovea.head import Eyes, Gaze, Head, fixate
+from torchfovea.correspondence import Budget, Correspondences
+from torchfovea.nearest import CellIndex, build_index, neighbour_spacing_rad
+from torchfovea.retina import LogPolar, Uniform
+from torchfovea.reward import RewardBelief, inverse_range_from_range, range_from_inverse_range, range_reward
+from torchfovea.setting import require
+from torchfovea.triangulation import observe
+from torchfovea.unscented import SigmaPoints
+
+__all__ = ["Eligibility", "Mind", "Observer", "Step", "decide", "new_mind", "perceive", "reward_of"]
+
+Acquisition = Callable[[Tensor, Tensor, Tensor], Tensor]
+
+
+def greedy_bound(mean: Tensor, std: Tensor, incumbent: Tensor) -> Tensor:
+    """The default acquisition: the upper confidence bound with α = 1 (Eq. 41)."""
+    return upper_confidence_bound(mean, std, 1.0)
+
+
+@dataclass(frozen=True)
+class Eligibility:
+    """Which cells may be fixated.
+
+    Attributes:
+        nearest_m: points nearer than this are not looked at.
+        ground_z_m: a seen cell whose point lies lower than this above the floor is ground, and not an object.
+    """
+
+    nearest_m: float = 0.5
+    ground_z_m: float = 0.05
+
+    def __post_init__(self) -> None:
+        """Raise SettingError for a negative distance."""
+        require(self.nearest_m >= 0, "eligibility.nearest_m", self.nearest_m, "at least 0 metres")
+
+
+@dataclass(frozen=True)
+class Observer:
+    """Everything about the observer that does not change while it looks around.
+
+    Attributes:
+        head: kinematics and limits.
+        camera: both eyes' camera, in retinal pixels.
+        retina: both eyes' retina.
+        budget: where a correspondence's standard deviation comes from.
+        points: sigma points of the unscented transform.
+        rotated: see `torchfovea.triangulation.sigma_root`.
+        fusion: how observations enter the memory.
+        prior: of a cell not yet seen.
+        reward: `inverse_range` or `range`: near is good, in either measure (Eq. 36).
+        acquisition: scores cells from (mean, std, incumbent).
+        eligibility: which cells may be fixated.
+    """
+
+    head: Head = field(default_factory=Head)
+    camera: Camera = field(default_factory=lambda: Pinhole.from_fov(135.0, 100.0))
+    retina: LogPolar | Uniform = field(default_factory=LogPolar)
+    budget: Budget = field(default_factory=Budget)
+    points: SigmaPoints = field(default_factory=SigmaPoints)
+    rotated: bool = True
+    fusion: Fusion = field(default_factory=Fusion)
+    prior: Prior = field(default_factory=Prior)
+    reward: str = "inverse_range"
+    acquisition: Acquisition = greedy_bound
+    eligibility: Eligibility = field(default_factory=Eligibility)
+
+    def __post_init__(self) -> None:
+        """Raise SettingError for an unknown reward."""
+        require(self.reward in ("inverse_range", "range"), "reward", self.reward, "inverse_range or range")
+
+
+class Mind(NamedTuple):
+    """A memory with the index that finds its cells.
+
+    Attributes:
+        memory: the ego-sphere.
+        index: of its cells.
+        spacing_rad: distance of each cell to its neighbours, (..., Nx).
+    """
+
+    memory: EgoSphere
+    index: CellIndex
+    spacing_rad: Tensor
+
+
+class Step(NamedTuple):
+    """What one step leaves behind.
+
+    Attributes:
+        mind: with what the saccade brought.
+        points: 3-D belief of every cell (..., Nx).
+        reward: its reward (..., Nx).
+        eligible: which cells may be fixated, bool (..., Nx).
+        cell: the one chosen, (...) int64; −1 if none is eligible.
+        gaze: the fixation that it asks for; straight ahead if none.
+    """
+
+    mind: Mind
+    points: Gaussian
+    reward: RewardBelief
+    eligible: Tensor
+    cell: Tensor
+    gaze: Gaze
+
+
+def new_mind(observer: Observer, cells: Tensor) -> Mind:
+    """An empty memory over given cells (..., Nx, 3), indexed."""
+    memory = new_egosphere(cells, observer.prior, observer.fusion.chart)
+    return Mind(memory, build_index(cells), neighbour_spacing_rad(cells))
+
+
+def perceive(
+    observer: Observer, mind: Mind, matches: Correspondences, eyes: Eyes, common: Tensor | None = None
+) -> Mind:
+    """Enter one saccade's correspondences into the memory.
+
+    Args:
+        observer: the fixed parts.
+        mind: before.
+        matches: the saccade's correspondences (..., N).
+        eyes: where the eyes were.
+        common: see `torchfovea.egosphere.fuse`.
+
+    Differentiable in the correspondences.
+    """
+    support = observer.retina.width_px(matches.left_px) / 2
+    observed = observe(matches, eyes, observer.camera, support, observer.points, observer.fusion.chart, observer.rotated)
+    memory = remember(mind.memory, mind.index, mind.spacing_rad, observed, observer.fusion, common)
+    return mind._replace(memory=memory)
+
+
+def reward_of(observer: Observer, mind: Mind) -> tuple[Gaussian, RewardBelief]:
+    """Each cell's 3-D belief and reward (Eq. 36-40). Unseen cells share the prior's reward exactly: ties are ties."""
+    moments = belief(mind.memory)
+    prior = observer.prior
+    if observer.fusion.chart == "cartesian":
+        points = moments
+        reward = range_reward(points)
+        unseen = RewardBelief(*(torch.tensor(v, dtype=points.mean.dtype) for v in (-prior.mean, prior.std)))
+        if observer.reward == "inverse_range":
+            reward, unseen = inverse_range_from_range(reward), inverse_range_from_range(unseen)
+    else:
+        points = cartesian_from_inverse_range(moments, mind.memory.cells)
+        reward = RewardBelief(moments.mean[..., 2], moments.cov[..., 5].sqrt())
+        unseen = RewardBelief(*(torch.tensor(v, dtype=points.mean.dtype) for v in (prior.mean, prior.std)))
+        if observer.reward == "range":
+            reward, unseen = range_from_inverse_range(reward), range_from_inverse_range(unseen)
+    seen = mind.memory.looks > 0
+    exact = (torch.where(seen, now, then.to(now)) for now, then in zip(reward, unseen, strict=True))
+    return points, RewardBelief(*exact)
+
+
+def decide(observer: Observer, mind: Mind, generator: torch.Generator | None = None) -> Step:
+    """Choose the next fixation (Eq. 41-43).
+
+    Args:
+        observer: the fixed parts.
+        mind: what is known.
+        generator: breaks exact ties.
+    """
+    points, reward = reward_of(observer, mind)
+    gaze, reachable = fixate(observer.head, points.mean)
+    seen = mind.memory.looks > 0
+    ground = seen & (points.mean[..., 2] + observer.head.ego_height_m < observer.eligibility.ground_z_m)
+    far_enough = (points.mean * points.mean).sum(-1) > observer.eligibility.nearest_m**2
+    eligible = reachable & far_enough & ~ground
+    floor = torch.full_like(reward.mean, -torch.inf)
+    incumbent = torch.where(eligible & seen, reward.mean, floor).amax(-1)
+    incumbent = torch.where(torch.isfinite(incumbent), incumbent, torch.where(eligible, reward.mean, floor).amax(-1))
+    incumbent = torch.where(torch.isfinite(incumbent), incumbent, torch.zeros_like(incumbent))
+    cell = choose(observer.acquisition(reward.mean, reward.std, incumbent), eligible, generator)
+    chosen = cell.clamp(min=0)[..., None]
+    ahead = (cell >= 0).to(points.mean.dtype)
+    return Step(mind, points, reward, eligible, cell, Gaze(*(g.gather(-1, chosen)[..., 0] * ahead for g in gaze)))

@@ -1,0 +1,195 @@
+"""From correspondences to 3-D Gaussians in the ego frame: triangulation and the unscented transform through it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchfovea.camera import Camera
+from torchfovea.chart import inverse_range_coordinates
+from torchfovea.gaussian import columns, positive_definite
+from torchfovea.head import Eyes, to_ego
+from torchfovea.correspondence import Correspondences
+from torchfovea.setting import require
+from torchfovea.unscented import SigmaPoints, unscented_transform
+
+__all__ = ["Observations", "observe", "sigma_root", "triangulate", "triangulate_homogeneous"]
+
+
+class Observations(NamedTuple):
+    """Gaussian points in a chart, one for each receptive field.
+
+    Attributes:
+        mean: (..., N, 3), chart coordinates (see `torchfovea.chart`).
+        cov: packed, (..., N, 6).
+        direction: unit directions in E, (..., N, 3); the nominal ones of the inverse-range chart.
+        support_rad: half the width that the receptive field covers, seen from the eye, (..., N).
+        valid: bool (..., N); the others are finite but mean nothing.
+    """
+
+    mean: Tensor
+    cov: Tensor
+    direction: Tensor
+    support_rad: Tensor
+    valid: Tensor
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    x, y, z = a.unbind(-1)
+    u, v, w = b.unbind(-1)
+    return columns(y * w - z * v, z * u - x * w, x * v - y * u)
+
+
+def triangulate(left: Tensor, right: Tensor, t_left: Tensor, t_right: Tensor) -> tuple[Tensor, Tensor]:
+    """Midpoint of the shortest segment between two rays (Eq. 8), in cross-product form.
+
+    With c = dₗ × dᵣ and the baseline b, the rays' parameters are s = (b × dᵣ)·c/|c|² and t = (b × dₗ)·c/|c|²; forming c
+    itself keeps float32 as good as float64, where the textbook's ac − b² does not.
+
+    Args:
+        left: directions dₗ (..., 3) of any length, in one frame with all others.
+        right: directions dᵣ (..., 3).
+        t_left: the left eye's centre, broadcastable to (..., 3) [m].
+        t_right: the right eye's centre.
+
+    Returns:
+        Points (..., 3) [m] and whether they lie in front of both eyes, bool (...). Where they do not (parallel rays
+        included) the point is finite and meaningless.
+
+    Differentiable where in front; zero gradient elsewhere.
+
+    References:
+        Wang, Liu (2007), for the midpoint method.
+    """
+    baseline = t_right - t_left
+    c = _cross(left, right)
+    square = (c * c).sum(-1)
+    s, t = (_cross(baseline, right) * c).sum(-1), (_cross(baseline, left) * c).sum(-1)
+    in_front = (s > 0) & (t > 0) & (square > 0)
+    inverse = 1 / torch.where(in_front, square, torch.ones_like(square))
+    point = (t_left + t_right + (s * inverse)[..., None] * left + (t * inverse)[..., None] * right) / 2
+    return torch.where(in_front[..., None], point, torch.ones_like(point)), in_front
+
+
+def triangulate_homogeneous(left: Tensor, right: Tensor, t_left: Tensor, t_right: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The midpoint method on the rays' common epipolar plane, as a homogeneous point.
+
+    With the plane's normal m = b × (dₗ + dᵣ) for unit rays, s = (b × dᵣ)·m/(c·m) and t = (b × dₗ)·m/(c·m). The two agree
+    with `triangulate` where the rays meet, but numerator and denominator stay finite and keep their signs through
+    parallel rays, where the shortest segment between skew rays would jump toward the eyes.
+
+    Args:
+        left: directions dₗ (..., 3) of any length, in one frame with all others.
+        right: directions dᵣ (..., 3).
+        t_left: the left eye's centre, broadcastable to (..., 3) [m].
+        t_right: the right eye's centre.
+
+    Returns:
+        X (..., 3) and w (...), the point being X/w (w < 0 beyond infinity), and whether the rays look ahead, so that X
+        points forward: bool (...).
+
+    Differentiable.
+    """
+    baseline = t_right - t_left
+    unit = (left * left).sum(-1, keepdim=True).rsqrt() * left + (right * right).sum(-1, keepdim=True).rsqrt() * right
+    normal = _cross(baseline, unit)
+    normal = normal * (normal * normal).sum(-1, keepdim=True).clamp(min=1e-24).rsqrt()
+    w = (_cross(left, right) * normal).sum(-1)
+    s, t = (_cross(baseline, right) * normal).sum(-1), (_cross(baseline, left) * normal).sum(-1)
+    ahead = (s > 0) & (t > 0)
+    x = (s[..., None] * left + t[..., None] * right + w[..., None] * (t_left + t_right)) / 2
+    return torch.where(ahead[..., None], x, torch.ones_like(x)), torch.where(ahead, w, torch.ones_like(w)), ahead
+
+
+def sigma_root(left_sigma: Tensor, right_sigma: Tensor, rotated: bool = True) -> Tensor:
+    """A square root of Σ = diag(σₗ², σₗ², σᵣ², σᵣ²) over (uₗ, vₗ, uᵣ, vᵣ) (Eq. 7).
+
+    Args:
+        left_sigma: (...) [px].
+        right_sigma: (...) [px].
+        rotated: turn the root so that its columns are disparity and version, horizontal and vertical: the version
+            columns move both eyes alike and leave the disparity alone, so that the whole curvature of triangulation
+            lies along one axis, where the sigma points integrate it. False: the diagonal (Cholesky) root.
+
+    Returns:
+        (..., 4, 4), Σ = root rootᵀ. Differentiable.
+    """
+    zero = torch.zeros_like(left_sigma)
+    if not rotated:
+        rows = [[left_sigma, zero, zero, zero], [zero, left_sigma, zero, zero]]
+        rows += [[zero, zero, right_sigma, zero], [zero, zero, zero, right_sigma]]
+    else:
+        scale = (left_sigma * left_sigma + right_sigma * right_sigma).rsqrt()
+        left, right, both = left_sigma**2 * scale, -(right_sigma**2) * scale, left_sigma * right_sigma * scale
+        rows = [[left, both, zero, zero], [zero, zero, left, both], [right, both, zero, zero], [zero, zero, right, both]]
+    flat = [entry for row in rows for entry in row]
+    return columns(*flat).unflatten(-1, (4, 4))
+
+
+def observe(
+    matches: Correspondences,
+    eyes: Eyes,
+    camera: Camera,
+    support_px: Tensor,
+    points: SigmaPoints | None = None,
+    chart: str = "inverse_range",
+    rotated: bool = True,
+) -> Observations:
+    """Correspondences as Gaussian points in the ego frame: the unscented transform through triangulation (Eq. 6-18, 22-27).
+
+    Args:
+        matches: correspondences (..., N) with their retinal standard deviations.
+        eyes: poses of the cameras in E, (...).
+        camera: both eyes' camera, in retinal pixels.
+        support_px: half the width of each left receptive field, (..., N) or (N,) [px].
+        points: sigma points of four dimensions; None: `SigmaPoints()`.
+        chart: `inverse_range` or `cartesian`.
+        rotated: see `sigma_root`.
+
+    Returns:
+        Observations. Valid are those whose nine sigma points all lie in front of both eyes (in inverse range: whose rays
+        look ahead, for infinity is an ordinary place there) and whose covariance is positive definite.
+
+    Raises:
+        SettingError: for an unknown chart.
+
+    Differentiable in the correspondences, their sigmas and the poses.
+    """
+    require(chart in ("inverse_range", "cartesian"), "chart", chart, "inverse_range or cartesian")
+    points = points or SigmaPoints()
+    mean = torch.cat([matches.left_px, matches.right_px], -1)
+    t_left, t_right = eyes.t_left.unsqueeze(-2), eyes.t_right.unsqueeze(-2)
+
+    def rays(px: Tensor) -> tuple[Tensor, Tensor]:
+        left, right = camera.rays(px[..., :2]), camera.rays(px[..., 2:])
+        return to_ego(eyes.R_left, left), to_ego(eyes.R_right, right)
+
+    in_front = torch.ones((), dtype=torch.bool)
+    direction = torch.empty(())
+
+    def through(px: Tensor) -> Tensor:
+        nonlocal in_front, direction
+        left, right = rays(px)
+        if chart == "cartesian":
+            point, in_front = triangulate(left, right, t_left, t_right)
+            direction = point[0] * (point[0] * point[0]).sum(-1, keepdim=True).rsqrt()
+            return point
+        x, w, in_front = triangulate_homogeneous(left, right, t_left, t_right)
+        direction = x[0] * (x[0] * x[0]).sum(-1, keepdim=True).rsqrt()
+        return inverse_range_coordinates(x, w, direction)
+
+    root = sigma_root(matches.left_sigma_px, matches.right_sigma_px, rotated)
+    value, cov, _ = unscented_transform(through, mean, root, points)
+    valid = matches.valid & in_front.all(0) & positive_definite(cov) & torch.isfinite(value).all(-1)
+    safe = columns(*(torch.full_like(valid, float(k in (0, 3, 5)), dtype=cov.dtype) for k in range(6)))
+    centre = camera.rays(matches.left_px)
+    support = support_px / camera.focal_px * (centre * centre).sum(-1).rsqrt()
+    return Observations(
+        torch.where(valid[..., None], value, torch.ones_like(value)),
+        torch.where(valid[..., None], cov, safe),
+        direction,
+        support.expand(valid.shape),
+        valid,
+    )
