@@ -17,11 +17,9 @@ LONGEST = 320
 FLOORS = (
     ("setting", "files"),
     ("gaussian",),
-    ("camera", "layout", "retina", "head", "unscented", "chart", "sphere", "nearest"),
-    (
-        *("matching", "geometric", "triangulation", "egosphere"),
-        *("acquisition", "infomax", "policies", "reward", "metrics", "significance"),
-    ),
+    ("camera", "layout", "retina", "sheets", "head", "unscented", "chart", "sphere", "nearest", "significance"),
+    ("correspondence", "sgbm", "matching", "geometric", "triangulation", "egosphere"),
+    ("acquisition", "policies", "infomax", "reward", "metrics", "characterization", "plane"),
     ("perception",),
     ("tuning", "episode"),
     ("sim",),
@@ -36,7 +34,7 @@ ONLY_IN = {
     "hydra": {"cli", "config", "mistakes", "experiments"},
     "omegaconf": {"cli", "config", "mistakes", "experiments", "doctor"},
     "matplotlib": {"pictures"},
-    "cv2": {"matching", "bench", "experiments"},
+    "cv2": {"sgbm", "bench", "experiments"},
     "rich": {"cli", "experiments", "doctor"},
     "skimage": {"experiments"},
 }

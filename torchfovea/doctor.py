@@ -38,9 +38,9 @@ OPTIONAL = {
 # Each probe runs in a process of its own: a broken GL set-up can end the process that imports MuJoCo, and MUJOCO_GL is
 # read at that import. It prints one line of JSON last.
 RAYS = """
-import os
-os.environ["MUJOCO_GL"] = "disable"
-import mujoco, numpy as np
+import numpy as np
+from torchfovea.sim.backend import load_mujoco
+mujoco = load_mujoco()
 spec = mujoco.MjSpec()
 spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 1])
 model = spec.compile()
