@@ -1,1 +1,1 @@
-"""The simulated world: MuJoCo scenes, renderers and the head. MuJoCo stops here; outwards all is tensors in the ego frame."""
+"""The simulated world: MuJoCo scenes, renderers and the head; MuJoCo stops here, outwards all is tensors in E."""

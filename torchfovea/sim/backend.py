@@ -28,8 +28,9 @@ def loadable_gl(backend: str) -> bool:
 def load_mujoco() -> ModuleType:
     """Import MuJoCo, with a GL backend that exists, or none.
 
-    An environment variable ``MUJOCO_GL`` that names a missing library makes ``import mujoco`` itself fail, although rays
-    and physics need no GL; it is set aside for the import then. Unset, it becomes the first of EGL and OSMesa that exists.
+    An environment variable ``MUJOCO_GL`` that names a missing library makes ``import mujoco`` itself fail, although
+    rays and physics need no GL; it is set aside for the import then. Unset, it becomes the first of EGL and OSMesa that
+    exists.
 
     Raises:
         SettingError: MuJoCo cannot be imported.

@@ -203,8 +203,9 @@ def place_cans(params: Cans, head: Head, rng: np.random.Generator, around: list[
     else:
         raise SettingError(
             f"scene.target_azimuth_deg = {params.target_azimuth_deg}, scene.target_elevation_deg = "
-            f"{params.target_elevation_deg}, scene.target_range_m = {params.target_range_m}: expected a region in which "
-            f"a can fits, within the head's reach" + (", outside the first view" if params.outside_first_view else "")
+            f"{params.target_elevation_deg}, scene.target_range_m = {params.target_range_m}: expected a region "
+            f"in which a can fits, within the head's reach"
+            + (", outside the first view" if params.outside_first_view else "")
         )
     limit = chosen[0][0].range_m[chosen[0][1]] + params.margin_m
     for _ in range(params.tries):
@@ -230,12 +231,14 @@ def place_cans(params: Cans, head: Head, rng: np.random.Generator, around: list[
 
 
 def target_in_sight(scene: Scene, margin_m: float) -> bool:
-    """Whether rays confirm a target: E sees nearly all of its front, both eyes and C see its nearest point when they fixate
-    it, and everything else that the head can reach is farther by the margin (its own pole by a fifth of it).
+    """Whether rays confirm a target.
+
+    E sees nearly all of its front, both eyes and C see its nearest point when they fixate it, and everything else that
+    the head can reach is farther by the margin (its own pole by a fifth of it).
     """
     geom = next(iter(scene.target_geoms))
     radius, half = scene.model.geom_size[geom][:2]
-    centre = torch.from_numpy(scene.model.geom_pos[geom].copy())
+    centre = torch.from_numpy(scene.data[0].geom_xpos[geom].copy())
     rotation, translation = (torch.from_numpy(a) for a in scene.world_from_ego)
     x, y, z = ((centre - translation) @ rotation).tolist()
     one = np.ones(1)

@@ -27,6 +27,7 @@ def add_head(spec: Any, head: Head) -> None:
     """
     import mujoco  # the caller holds an MjSpec: MuJoCo is loaded
 
+    spec.compiler.degree = False
     spec.option.timestep = 0.001
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     limits = {

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.head import Head
-from torchfovea.sim.room import FLOOR, TARGET
+from torchfovea.sim.room import FLOOR, TARGET, Solid
 from torchfovea.sim.texture import Paint
 
 __all__ = ["EgoPose", "Nearest", "Scene"]
@@ -39,6 +39,7 @@ class Nearest(NamedTuple):
     geom: int
 
 
+_ORIGIN = EgoPose()
 _NOTHING = Nearest(torch.zeros(3, dtype=torch.float64), math.inf, -1)
 
 
@@ -49,6 +50,7 @@ class Scene:
     Attributes:
         model: the MjModel; geoms have names, the head is in it.
         data: two MjData, one for each thread that casts rays.
+        solids: what it was compiled from, in the order of the geoms.
         paint: what the geoms look like.
         kind: (G,) FLOOR, ROOM, FURNITURE, POLE, CAN or TARGET of each geom (`torchfovea.sim.room`).
         head: whose reach the truth is about.
@@ -60,10 +62,11 @@ class Scene:
 
     model: Any
     data: tuple[Any, Any]
+    solids: tuple[Solid, ...]
     paint: Paint
     kind: Tensor
     head: Head
-    pose: EgoPose = EgoPose()
+    pose: EgoPose = _ORIGIN
     nearest: Nearest = _NOTHING
     params: object = None
     seed: int = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from typing import NamedTuple
@@ -22,6 +23,9 @@ MISS_RANGE_M = 1000.0
 """The range that a ray gets which meets nothing; its geom is -1."""
 
 _PARALLEL_FROM = 4000  # rays below which a second thread costs more than it saves
+_STEEPEST = 0.12  # cosine of the slant at which the footprint stops growing
+_CUTOFF_M = 1e6  # surfaces beyond are misses
+_CHUNK = 8192  # pixels shaded at once: they stay in the cache, and torch starts no threads of its own for them
 
 
 class RayHits(NamedTuple):
@@ -59,30 +63,51 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(2, thread_name_prefix="torchfovea-rays")
 
 
-def _cast_world(scene: Scene, origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Ranges, geoms and normals of unit directions (N, 3) float64, all in the world."""
+def _cast_part(
+    scene: Scene, worker: int, origin: np.ndarray, direction: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Ranges, geoms and normals of unit directions (N, 3) float64, all in the world.
+
+    mj_multiRay works on the stack of its MjData, hence each worker has its own.
+    """
     mujoco = load_mujoco()
     n = len(direction)
     geom, distance, normal = np.empty(n, np.int32), np.empty(n), np.empty((n, 3))
-
-    def part(data: object, rows: slice) -> None:
-        # MuJoCo wants the vectors flat
-        mujoco.mj_multiRay(
-            scene.model, data, origin, direction[rows].reshape(-1), None, True, -1, geom[rows], distance[rows],
-            normal[rows].reshape(-1), rows.stop - rows.start, mujoco.mjMAXVAL,
-        )  # fmt: skip
-
-    if n < _PARALLEL_FROM or torch.get_num_threads() < 2:
-        part(scene.data[0], slice(0, n))
-    else:
-        # mj_multiRay works on the stack of its MjData: one for each thread
-        half = _pool().submit(part, scene.data[1], slice(n // 2, n))
-        part(scene.data[0], slice(0, n // 2))
-        half.result()
+    # MuJoCo wants the vectors flat
+    flat = np.ascontiguousarray(direction).reshape(-1)
+    mujoco.mj_multiRay(
+        scene.model, scene.data[worker], origin, flat, None, True, -1, geom, distance, normal.reshape(-1), n, _CUTOFF_M
+    )
     miss = geom < 0
     if miss.any():
         distance[miss] = MISS_RANGE_M
         normal[miss] = 0
+    return distance, geom, normal
+
+
+def _in_parallel(n: int, work: Callable[[int], None]) -> None:
+    """Run work(0) and work(1), on two threads if n rays are worth it; MuJoCo and torch let go of the GIL."""
+    if n < _PARALLEL_FROM or torch.get_num_threads() < 2:
+        work(0)
+        work(1)
+    else:
+        other = _pool().submit(work, 1)
+        work(0)
+        other.result()
+
+
+def _cast_world(scene: Scene, origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    n = len(direction)
+    if n < _PARALLEL_FROM:
+        return _cast_part(scene, 0, origin, direction)
+    parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = [()] * 2  # type: ignore[list-item]
+
+    def work(worker: int) -> None:
+        rows = slice(0, n // 2) if worker == 0 else slice(n // 2, n)
+        parts[worker] = _cast_part(scene, worker, origin, direction[rows])
+
+    _in_parallel(n, work)
+    distance, geom, normal = (np.concatenate(pair) for pair in zip(*parts, strict=True))
     return distance, geom, normal
 
 
@@ -154,36 +179,39 @@ def render(scene: Scene, R: Tensor, t: Tensor, camera: Camera, size_px: int) -> 
     rotation, translation = scene.world_from_ego
     turn = rotation @ R.detach().to("cpu", torch.float64).numpy()
     origin = rotation @ t.detach().to("cpu", torch.float64).numpy() + translation
-    direction = ray @ turn.T
-    distance, geom, normal = _cast_world(scene, origin, direction)
-    image = shade(scene, origin, direction, distance, geom, normal, span)
-    shape = (size_px, size_px)
-    return Frame(
-        image.T.reshape(3, *shape).contiguous(),
-        torch.from_numpy(distance).float().reshape(shape),
-        torch.from_numpy(geom).long().reshape(shape),
-        torch.from_numpy(normal @ rotation).float().reshape(*shape, 3),
-    )
+    n = len(ray)
+    image = torch.empty(3, n)
+    distance = torch.empty(n)
+    geom = torch.empty(n, dtype=torch.long)
+    normal = torch.empty(n, 3)
+    to_ego = torch.from_numpy(rotation).float()
+
+    def work(worker: int) -> None:
+        for start in range(worker * _CHUNK, n, 2 * _CHUNK):
+            rows = slice(start, min(start + _CHUNK, n))
+            direction = ray[rows] @ turn.T
+            far, index, across = (torch.from_numpy(a) for a in _cast_part(scene, worker, origin, direction))
+            distance[rows], geom[rows] = far, index
+            across = across.float()
+            normal[rows] = across @ to_ego
+            image[:, rows] = _shade(
+                scene, torch.from_numpy(origin).float(), torch.from_numpy(direction).float(), distance[rows], geom[rows],
+                across, span[rows],
+            ).T  # fmt: skip
+
+    _in_parallel(n, work)
+    side = (size_px, size_px)
+    return Frame(image.reshape(3, *side), distance.reshape(side), geom.reshape(side), normal.reshape(*side, 3))
 
 
-def shade(
-    scene: Scene,
-    origin: np.ndarray,
-    direction: np.ndarray,
-    distance: np.ndarray,
-    geom: np.ndarray,
-    normal: np.ndarray,
-    span: Tensor,
+def _shade(
+    scene: Scene, origin: Tensor, direction: Tensor, distance: Tensor, geom: Tensor, normal: Tensor, span: Tensor
 ) -> Tensor:
     """Colours (N, 3) of hits in the world; a miss is sky."""
-    way = torch.from_numpy(direction).float()
-    far = torch.from_numpy(distance).float()
-    across = torch.from_numpy(normal).float()
-    index = torch.from_numpy(geom).long()
-    point = torch.from_numpy(origin).float() + far[:, None] * way
-    slant = (way * across).sum(-1).abs().clamp(min=0.12)
-    rgb = colour(scene.paint, index.clamp(min=0), point, across, far * span / slant)
-    missed = index < 0
+    point = origin + distance[:, None] * direction
+    slant = (direction * normal).sum(-1).abs().clamp(min=_STEEPEST)
+    rgb = colour(scene.paint, geom.clamp(min=0), point, normal, distance * span / slant)
+    missed = geom < 0
     if bool(missed.any()):
         rgb[missed] = torch.tensor([0.62, 0.72, 0.82])
     return rgb

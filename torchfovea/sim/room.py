@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,7 +16,21 @@ from torchfovea.sim.backend import load_mujoco
 from torchfovea.sim.head_model import add_head
 from torchfovea.sim.texture import Paint
 
-__all__ = ["CAN", "FLOOR", "FURNITURE", "POLE", "ROOM", "TARGET", "Room", "Solid", "can", "compile_scene", "furnish"]
+__all__ = [
+    "CAN",
+    "FLOOR",
+    "FURNITURE",
+    "POLE",
+    "ROOM",
+    "TARGET",
+    "Room",
+    "Solid",
+    "can",
+    "build_spec",
+    "furnish",
+    "paint_solids",
+    "pole",
+]
 
 # kinds of geom
 FLOOR, ROOM, FURNITURE, POLE, CAN, TARGET = range(6)
@@ -102,7 +117,7 @@ def furnish(room: Room, rng: np.random.Generator) -> list[Solid]:
         ("left", (middle, room.side_m + thick, tall), (half, thick, tall)),
         ("right", (middle, -room.side_m - thick, tall), (half, thick, tall)),
     ]
-    solids = [Solid("floor", FLOOR, "plane", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 0.0, *_FLOOR)]
+    solids = [Solid("floor", FLOOR, "plane", (middle, 0.0, 0.0), (half + 1, room.side_m + 1, 1.0), 0.0, *_FLOOR)]
     order = rng.permutation(len(_WALLS))
     for (name, place, size), k in zip(walls, order, strict=True):
         solids.append(Solid(f"wall_{name}", ROOM, "box", place, size, 0.0, *_WALLS[k]))
@@ -135,8 +150,8 @@ def pole(name: str, x: float, y: float, top_m: float, radius_m: float) -> Solid:
     return Solid(name, POLE, "cylinder", (x, y, top_m / 2), (radius_m, top_m / 2), 0.0, _METAL, (0.3, 0.31, 0.33), 0.7)
 
 
-def compile_scene(solids: list[Solid], head: Head, rng: np.random.Generator) -> tuple[Any, Paint, torch.Tensor]:
-    """The MuJoCo model of solids with a head in it, their paint, and the kind of each geom (G,)."""
+def build_spec(solids: Sequence[Solid], head: Head) -> Any:
+    """The MjSpec of solids with a head among them; geoms are in the order of the solids, and bear their names."""
     mujoco = load_mujoco()
     spec = mujoco.MjSpec()
     # without these two, software GL is twenty times slower
@@ -159,34 +174,24 @@ def compile_scene(solids: list[Solid], head: Head, rng: np.random.Generator) -> 
     for solid in solids:
         size = list(solid.size_m) + [0.0] * (3 - len(solid.size_m))
         turn = [math.cos(solid.yaw_rad / 2), 0, 0, math.sin(solid.yaw_rad / 2)]
-        spec.worldbody.add_geom(
-            name=solid.name, type=shapes[solid.shape], size=size, pos=list(solid.position_m), quat=turn,
-            rgba=[*solid.base, 1.0], contype=0, conaffinity=0,
-        )  # fmt: skip
+        # a body each: rays are tested against the bounding sphere of a body first
+        place = spec.worldbody.add_body(pos=list(solid.position_m), quat=turn)
+        place.add_geom(
+            name=solid.name, type=shapes[solid.shape], size=size, rgba=[*solid.base, 1.0], contype=0, conaffinity=0
+        )
     add_head(spec, head)
-    model = spec.compile()
-    kinds = torch.tensor([s.kind for s in solids])
-    return model, _paint(solids, rng), kinds
+    return spec
 
 
-def _paint(solids: list[Solid], rng: np.random.Generator) -> Paint:
-    turns = np.linalg.qr(rng.standard_normal((len(solids), 3, 3)))[0]
-    axes = []
-    for solid in solids:
-        c, s = math.cos(solid.yaw_rad), math.sin(solid.yaw_rad)
-        axes.append([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+def paint_solids(solids: Sequence[Solid], rng: np.random.Generator) -> Paint:
+    """What the solids look like; the generator draws each one's place in the noise."""
 
     def tensor(values: Any) -> torch.Tensor:
         return torch.as_tensor(np.asarray(values), dtype=torch.float32)
 
-    own = tensor(axes)
     return Paint(
-        rotation=tensor(turns) @ own,
-        centre=tensor([s.position_m for s in solids]),
+        look=tensor([(*s.base, *s.accent, s.contrast) for s in solids]),
         offset=tensor(rng.uniform(0, 20, (len(solids), 3))),
-        base=tensor([s.base for s in solids]),
-        accent=tensor([s.accent for s in solids]),
-        contrast=tensor([s.contrast for s in solids]),
-        axes=own,
+        centre=tensor([s.position_m for s in solids]),
         can=tensor([s.size_m if s.label else (0.0, 0.0) for s in solids]),
     )

@@ -6,13 +6,14 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import torch
 
 from torchfovea.head import Head
 from torchfovea.setting import require
 from torchfovea.sim.backend import load_mujoco
 from torchfovea.sim.cans import Cans, place_cans, target_in_sight
 from torchfovea.sim.model import EgoPose, Nearest, Scene
-from torchfovea.sim.room import Room, Solid, can, compile_scene, furnish
+from torchfovea.sim.room import Room, Solid, can, build_spec, furnish, paint_solids
 from torchfovea.sim.truth import find_nearest
 
 __all__ = ["AttentionWorld", "Cans", "EgoPose", "Nearest", "Room", "Scene", "build_scene", "stand_at"]
@@ -92,8 +93,10 @@ def _attention_solids(params: AttentionWorld, rng: np.random.Generator) -> list[
 
 def _compile(solids: list[Solid], head: Head, rng: np.random.Generator, params: object, seed: int) -> Scene:
     mujoco = load_mujoco()
-    model, paint, kind = compile_scene(solids, head, rng)
+    model = build_spec(solids, head).compile()
     data = tuple(mujoco.MjData(model) for _ in range(2))
     for d in data:
         mujoco.mj_forward(model, d)
-    return Scene(model, (data[0], data[1]), paint, kind, head, params=params, seed=seed)
+    kind = torch.tensor([solid.kind for solid in solids])
+    paint = paint_solids(solids, rng)
+    return Scene(model, (data[0], data[1]), tuple(solids), paint, kind, head, params=params, seed=seed)

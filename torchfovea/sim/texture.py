@@ -1,8 +1,8 @@
 """Procedural solid texture: the colour of a point of an object, filtered to the pixel that sees it.
 
-Each geom carries its own place in one periodic volume of band-limited noise (three octaves a volume, the volume looked up at
-three scales a factor 8 apart, each turned so that no period lines up with a wall). An octave fades as its wavelength nears
-the pixel's footprint, hence far surfaces are smooth instead of aliased and two eyes see one colour.
+Each geom has its own place in one periodic volume of band-limited noise: three octaves, looked up at three scales a
+factor 8 apart, each turned so that no period lines up with a wall. An octave fades as its wavelength nears the pixel's
+footprint, hence far surfaces are smooth instead of aliased and two eyes see one colour.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from torch import Tensor
 
 __all__ = ["Paint", "colour"]
 
-_SIZE = 96  # voxels a side of the noise volume
+_SIZE = 64  # voxels a side of the noise volume
 _WAVELENGTHS = (5.0, 10.0, 20.0)  # of its octaves [voxels]
 _VOXELS_M = (0.0006, 0.0048, 0.0384)  # the three scales: wavelengths 3 mm to 0.77 m
 _AMPLITUDES = (0.12, 0.14, 0.16, 0.17, 0.17, 0.15, 0.13, 0.12, 0.10)  # log albedo, fine to coarse
 _PIXEL_SIGMA = 0.45  # of a pixel's Gaussian footprint, in pixels
-_CELLS = 2  # grid_sample runs one thread a batch entry
+_AMBIENT = 0.5
 _LIGHTS = ((0.35, 0.45, 0.82, 0.42), (-0.75, -0.35, 0.56, 0.16))  # direction and strength, in the world
 
 
@@ -30,23 +30,15 @@ class Paint(NamedTuple):
     """What each of G geoms looks like.
 
     Attributes:
-        rotation: (G, 3, 3), world to the geom's texture frame.
-        centre: (G, 3), the geom's centre in the world [m].
-        offset: (G, 3), its place in the noise [m].
-        base: (G, 3), RGB.
-        accent: (G, 3), RGB mixed in at large scale.
-        contrast: (G,), strength of the noise.
-        axes: (G, 3, 3), world to the geom's own frame.
-        can: (G, 2), radius and half height of a can's label [m]; 0 for everything else.
+        look: (G, 7), RGB; RGB mixed in at large scale; strength of the noise.
+        offset: (G, 3), its place in the noise, added to world coordinates [m].
+        centre: (G, 3), in the world [m].
+        can: (G, 2), radius and half height of an upright can's label [m]; 0 for everything else.
     """
 
-    rotation: Tensor
-    centre: Tensor
+    look: Tensor
     offset: Tensor
-    base: Tensor
-    accent: Tensor
-    contrast: Tensor
-    axes: Tensor
+    centre: Tensor
     can: Tensor
 
 
@@ -69,7 +61,8 @@ def _volume() -> Tensor:
     # one voxel more on each far side closes the period for linear interpolation
     for axis in (2, 3, 4):
         volume = torch.cat([volume, volume.narrow(axis, 0, 1)], axis)
-    return volume.contiguous()
+    # a voxel's channels side by side: one cache line instead of four
+    return volume.to(memory_format=torch.channels_last_3d)
 
 
 @lru_cache(maxsize=1)
@@ -79,16 +72,33 @@ def _turns() -> Tensor:
     return torch.linalg.qr(torch.randn(3, 3, 3, generator=generator))[0]
 
 
-def _noise(points: Tensor, scale: int, channels: slice) -> Tensor:
-    """Noise at points (N, 3) [m] in the texture frame, (N, C)."""
-    n = points.shape[0]
+def _noise(points: Tensor, scale: int, channels: int) -> Tensor:
+    """Noise at points (N, 3) [m], (C, N)."""
     place = points @ (_turns()[scale] / (_VOXELS_M[scale] * _SIZE))
-    place = (place - place.floor()) * 2 - 1
-    pad = -n % _CELLS
-    grid = F.pad(place, (0, 0, 0, pad)).reshape(_CELLS, 1, 1, -1, 3)
-    volume = _volume()[:, channels].expand(_CELLS, -1, -1, -1, -1)
-    sampled = F.grid_sample(volume, grid, align_corners=True)  # (cells, C, 1, 1, n/cells)
-    return sampled.permute(0, 2, 3, 4, 1).reshape(-1, sampled.shape[1])[:n]
+    grid = ((place - place.floor()) * 2 - 1)[None, None, None]
+    return F.grid_sample(_volume()[:, :channels], grid, align_corners=True)[0, :, 0, 0]
+
+
+def _fading(scale: int) -> list[tuple[float, float]]:
+    """Amplitude of a scale's octaves, and their decay with the variance of the Gaussian footprint."""
+    octaves = zip(_AMPLITUDES[3 * scale :], _WAVELENGTHS, strict=False)
+    return [(a, -2 * math.pi**2 / (w * _VOXELS_M[scale]) ** 2) for a, w in octaves]
+
+
+def _widest(scale: int) -> float:
+    """The footprint's variance at which a scale's coarsest octave has all but vanished."""
+    amplitude, decay = _fading(scale)[-1]
+    return math.log(0.004 / amplitude) / decay
+
+
+def _octaves(noise: Tensor, spread: Tensor, scale: int) -> tuple[Tensor, Tensor]:
+    """Sum (N,) of a scale's faded octaves, and its variance (N,)."""
+    value, power = torch.zeros_like(spread), torch.zeros_like(spread)
+    for wave, (amplitude, decay) in zip(noise, _fading(scale), strict=True):
+        fade = torch.exp(decay * spread) * amplitude
+        value.addcmul_(wave, fade)
+        power.addcmul_(fade, fade)
+    return value, power
 
 
 def _smoothstep(x: Tensor) -> Tensor:
@@ -98,7 +108,7 @@ def _smoothstep(x: Tensor) -> Tensor:
 
 def _label(local: Tensor, size: Tensor, footprint: Tensor, base: Tensor) -> Tensor:
     """A can's albedo (N, 3): its own colour with a white wave around it, metal at both ends."""
-    radius, half = size.unbind(-1)
+    half = size[:, 1]
     x, y, z = local.unbind(-1)
     angle = torch.atan2(y, x)
     height = z / half
@@ -130,43 +140,35 @@ def colour(paint: Paint, geom: Tensor, point_w: Tensor, normal_w: Tensor, footpr
     Returns:
         (N, 3) RGB in [0, 1], float32.
     """
-    relative = (point_w - paint.centre[geom])[:, None, :]
-    solid = (relative @ paint.rotation[geom].mT)[:, 0] + paint.offset[geom]
+    solid = point_w + paint.offset[geom]
     spread = (_PIXEL_SIGMA * footprint_m) ** 2
-    log_albedo = torch.zeros_like(footprint_m)
-    kept = torch.zeros_like(footprint_m)
-    mix = torch.zeros_like(footprint_m)
-    for scale, voxel in enumerate(_VOXELS_M):
-        waves = [w * voxel for w in _WAVELENGTHS]
-        fades = torch.stack([torch.exp(-2 * math.pi**2 / (w * w) * spread) for w in waves], -1)
-        fades = fades * fades.new_tensor(_AMPLITUDES[3 * scale : 3 * scale + 3])
-        coarse = scale == len(_VOXELS_M) - 1
+    look = paint.look[geom]
+    log_albedo, kept = torch.zeros_like(spread), torch.zeros_like(spread)
+    for scale in range(len(_VOXELS_M) - 1):
         # most pixels are too wide for the finest octaves: look up only those that are not
-        rows = None if coarse else (fades[:, 2] > 0.004).nonzero()[:, 0]
-        if rows is not None and rows.numel() == 0:
+        rows = (spread < _widest(scale)).nonzero()[:, 0]
+        if rows.numel() == 0:
             continue
-        if rows is None or rows.numel() > 0.8 * footprint_m.numel():
-            noise = _noise(solid, scale, slice(0, 4) if coarse else slice(0, 3))
-            log_albedo = log_albedo + (noise[:, :3] * fades).sum(-1)
-            kept = kept + (fades * fades).sum(-1)
-            if coarse:
-                mix = torch.sigmoid(3 * noise[:, 3])
+        if rows.numel() > 0.8 * spread.numel():
+            value, power = _octaves(_noise(solid, scale, 3), spread, scale)
+            log_albedo += value
+            kept += power
         else:
-            part = fades[rows]
-            log_albedo = log_albedo.index_add(0, rows, (_noise(solid[rows], scale, slice(0, 3)) * part).sum(-1))
-            kept = kept.index_add(0, rows, (part * part).sum(-1))
-    base = paint.base[geom]
-    albedo = base + 0.65 * mix[:, None] * (paint.accent[geom] - base)
-    labelled = paint.can[geom, 0] > 0
-    if bool(labelled.any()):
-        rows = labelled.nonzero()[:, 0]
+            value, power = _octaves(_noise(solid[rows], scale, 3), spread[rows], scale)
+            log_albedo.index_add_(0, rows, value)
+            kept.index_add_(0, rows, power)
+    coarse = _noise(solid, len(_VOXELS_M) - 1, 4)
+    value, power = _octaves(coarse[:3], spread, len(_VOXELS_M) - 1)
+    base = look[:, :3]
+    albedo = base + 0.65 * torch.sigmoid(3 * coarse[3])[:, None] * (look[:, 3:6] - base)
+    rows = (paint.can[geom, 0] > 0).nonzero()[:, 0]
+    if rows.numel() > 0:
         own = geom[rows]
-        local = (relative[rows] @ paint.axes[own].mT)[:, 0]
-        albedo = albedo.index_copy(0, rows, _label(local, paint.can[own], footprint_m[rows], albedo[rows]))
-    contrast = paint.contrast[geom]
+        albedo[rows] = _label(point_w[rows] - paint.centre[own], paint.can[own], footprint_m[rows], albedo[rows])
+    contrast = look[:, 6]
     # the mean of exp(noise) shrinks as octaves fade; put it back, or far walls would darken
-    gain = torch.exp(contrast * log_albedo - contrast * contrast * kept / 2)
-    light = torch.full_like(gain, 0.5)
+    gain = torch.exp(contrast * (log_albedo + value) - contrast * contrast * (kept + power) / 2)
+    light = torch.full_like(gain, _AMBIENT)
     for *direction, strength in _LIGHTS:
-        light = light + strength * (normal_w @ normal_w.new_tensor(direction)).clamp(min=0)
+        light += strength * (normal_w @ normal_w.new_tensor(direction)).clamp(min=0)
     return (albedo * (gain * light)[:, None]).clamp(0, 1)

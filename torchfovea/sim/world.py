@@ -10,9 +10,12 @@ from torch import Tensor
 from torchfovea.camera import Camera, Pinhole, image_camera
 from torchfovea.head import Gaze, Head, clamp_gaze, cyclopean, eyes, to_ego
 from torchfovea.setting import require
+from torchfovea.sim.gl import available_gl
+from torchfovea.sim.gl import render as render_gl
 from torchfovea.sim.model import Scene
 from torchfovea.sim.motor import InstantMotor, Moved
 from torchfovea.sim.rays import Frame, RayHits, cast, render
+from torchfovea.sim.servo import ServoMotor
 
 __all__ = ["Fixated", "Seen", "World"]
 
@@ -41,8 +44,8 @@ class Seen(NamedTuple):
     Attributes:
         points_e: (N, 3) in E [m]; far out on the ray for a miss.
         hit: (N,) bool, whether the left ray meets a surface.
-        visible_right: (N,) bool, whether the right eye has a free line of sight to it and it lies before that eye; whether
-            it falls on the right retina is the retina's to say.
+        visible_right: (N,) bool, whether the right eye has a free line of sight to it and it lies before that eye;
+            whether it falls on the right retina is the retina's to say.
     """
 
     points_e: Tensor
@@ -71,7 +74,7 @@ class World:
         scene: Scene,
         head: Head | None = None,
         renderer: Literal["rays", "gl"] = "rays",
-        motor: Literal["instant", "physics"] | InstantMotor = "instant",
+        motor: Literal["instant", "physics"] | InstantMotor | ServoMotor = "instant",
         camera: Camera | None = None,
         source_px: int = 400,
         radius_px: float = 100.0,
@@ -85,10 +88,19 @@ class World:
         self.camera = Pinhole.from_fov(90.0, radius_px) if camera is None else camera
         self.source_px = source_px
         self.image_camera = image_camera(self.camera, radius_px, source_px)
-        require(motor == "instant" or isinstance(motor, InstantMotor), "motor", motor, "instant")
-        require(renderer == "rays", "renderer", renderer, "rays")
-        self.motor = motor if isinstance(motor, InstantMotor) else InstantMotor()
-        self._render = render
+        if renderer == "gl":
+            backend = available_gl()
+            require(backend is not None, "renderer", "gl", "a machine with EGL or OSMesa (renderer=rays needs neither)")
+        self._render = render_gl if renderer == "gl" else render
+        self.motor: InstantMotor | ServoMotor
+        if motor == "instant":
+            self.motor = InstantMotor()
+        elif motor == "physics":
+            self.motor = ServoMotor(scene.model)
+        else:
+            require(isinstance(motor, InstantMotor | ServoMotor), "motor", motor, "instant, physics or a motor")
+            assert isinstance(motor, InstantMotor | ServoMotor)
+            self.motor = motor
         zero = torch.zeros((), dtype=torch.float64)
         self.gaze = Gaze(zero, zero, zero)
 
@@ -111,10 +123,11 @@ class World:
     def images(self, gaze: Gaze | None = None) -> tuple[Frame, Frame]:
         """Left and right pictures at a gaze (the current one by default)."""
         pose = eyes(self.head, self._one(gaze))
-        return tuple(
+        left, right = (
             self._render(self.scene, r, t, self.image_camera, self.source_px)
             for r, t in ((pose.R_left, pose.t_left), (pose.R_right, pose.t_right))
         )
+        return left, right
 
     def fixated(self, gaze: Gaze | None = None) -> Fixated:
         """The truth about a gaze (the current one by default): the first surface on the cyclopean ray."""
@@ -135,12 +148,12 @@ class World:
         """The truth about directions (N, 3) from E's origin."""
         return cast(self.scene, torch.zeros(3, dtype=torch.float64), directions_e)
 
-    def correspond(self, left_directions: Tensor, gaze: Gaze | None = None) -> Seen:
+    def correspond(self, gaze: Gaze | None, left_directions: Tensor) -> Seen:
         """What the left eye's rays meet, and whether the right eye sees the same points: a sensor without pictures.
 
         Args:
+            gaze: where the head looks; None for the current one.
             left_directions: (N, 3) in the left camera's frame, of any positive length.
-            gaze: the current one by default.
 
         Returns:
             In the directions' dtype; computed in float64.
