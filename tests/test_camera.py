@@ -33,7 +33,9 @@ def test_agrees_with_opencv():
 
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_finite_everywhere_with_finite_gradients(camera, dtype):
-    direction = torch.tensor([[0, 0, 1], [0, 0, -1], [1, 0, 0], [0, 1, -1], [0, 0, 0], [1e-9, 0, 1]], dtype=dtype, requires_grad=True)
+    direction = torch.tensor(
+        [[0, 0, 1], [0, 0, -1], [1, 0, 0], [0, 1, -1], [0, 0, 0], [1e-9, 0, 1]], dtype=dtype, requires_grad=True
+    )
     px = camera.project(direction)
     px.sum().backward()
     assert px.dtype == dtype and bool(torch.isfinite(px).all()) and bool(torch.isfinite(direction.grad).all())
@@ -63,13 +65,16 @@ def test_field_of_view_and_image_camera(kind, half):
     torch.testing.assert_close(image.rays(torch.tensor([[399.5, 199.5]], dtype=torch.float64)), edge)
 
 
-@pytest.mark.parametrize(("call", "name"), [
-    (lambda: Pinhole.from_fov(180, 100), "fov_deg = 180"),
-    (lambda: Pinhole.from_fov(0, 100), "fov_deg = 0"),
-    (lambda: Fisheye.from_fov(360, 100), "fov_deg = 360"),
-    (lambda: Pinhole(0), "focal_px = 0"),
-    (lambda: Fisheye(float("nan")), "focal_px = nan"),
-])
+@pytest.mark.parametrize(
+    ("call", "name"),
+    [
+        (lambda: Pinhole.from_fov(180, 100), "fov_deg = 180"),
+        (lambda: Pinhole.from_fov(0, 100), "fov_deg = 0"),
+        (lambda: Fisheye.from_fov(360, 100), "fov_deg = 360"),
+        (lambda: Pinhole(0), "focal_px = 0"),
+        (lambda: Fisheye(float("nan")), "focal_px = nan"),
+    ],
+)
 def test_errors_name_the_setting(call, name):
     with pytest.raises(SettingError, match=name):
         call()

@@ -79,7 +79,9 @@ def test_cartesian_moments_match_samples_where_noise_is_small():
 def test_far_and_beyond_infinity_stay_finite():
     direction = units(3, 0)
     mean = torch.tensor([[0.0, 0, 0], [0, 0, -0.3], [0, 0, 1e-9]], dtype=torch.float64, requires_grad=True)
-    got = cartesian_from_inverse_range(Gaussian(mean, pack(torch.eye(3, dtype=torch.float64).expand(3, 3, 3))), direction, far_m=50.0)
+    got = cartesian_from_inverse_range(
+        Gaussian(mean, pack(torch.eye(3, dtype=torch.float64).expand(3, 3, 3))), direction, far_m=50.0
+    )
     torch.testing.assert_close(got.mean.norm(dim=-1), torch.full((3,), 50.0, dtype=torch.float64))
     got.cov.sum().backward()
     assert bool(torch.isfinite(got.cov).all()) and bool(torch.isfinite(mean.grad).all())
@@ -100,15 +102,20 @@ def test_turns_are_the_smallest_rotation_in_both_charts(seed):
         sine, cosine = np.linalg.norm(axis), float(source[i] @ target[i])
         rotation = Rotation.from_rotvec(axis / max(sine, 1e-300) * np.arctan2(sine, cosine)).as_matrix()
         np.testing.assert_allclose(want.mean[i], rotation @ cartesian.mean[i].numpy(), atol=1e-9)
-        np.testing.assert_allclose(unpack(want.cov[i]), rotation @ unpack(cartesian.cov[i]).numpy() @ rotation.T, atol=1e-9)
+        np.testing.assert_allclose(
+            unpack(want.cov[i]), rotation @ unpack(cartesian.cov[i]).numpy() @ rotation.T, atol=1e-9
+        )
 
 
-@pytest.mark.parametrize("function", [
-    lambda m, c, n, t: tuple(cartesian_from_inverse_range(Gaussian(m, c), n)),
-    lambda m, c, n, t: tuple(turn_inverse_range(Gaussian(m, c), n, t)),
-    lambda m, c, n, t: tuple(turn_cartesian(Gaussian(m, c), n, t)),
-    lambda m, c, n, t: inverse_range_coordinates(m, c[..., 0], n),
-])
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda m, c, n, t: tuple(cartesian_from_inverse_range(Gaussian(m, c), n)),
+        lambda m, c, n, t: tuple(turn_inverse_range(Gaussian(m, c), n, t)),
+        lambda m, c, n, t: tuple(turn_cartesian(Gaussian(m, c), n, t)),
+        lambda m, c, n, t: inverse_range_coordinates(m, c[..., 0], n),
+    ],
+)
 def test_gradients(function):
     b = belief(2, 5)
     inputs = (b.mean.contiguous(), b.cov.contiguous(), units(2, 6), units(2, 7))

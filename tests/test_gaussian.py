@@ -52,7 +52,9 @@ def test_algebra_agrees_with_linalg(seed):
 
 
 def test_not_positive_definite_is_told():
-    s = pack(torch.stack([torch.diag(torch.tensor(d)) for d in ([1.0, 1, 0], [1, -1, 1], [1, 1, torch.inf], [1, 2, 3])]))
+    s = pack(
+        torch.stack([torch.diag(torch.tensor(d)) for d in ([1.0, 1, 0], [1, -1, 1], [1, 1, torch.inf], [1, 2, 3])])
+    )
     assert positive_definite(s).tolist() == [False, False, False, True]
     singular = pack(torch.tensor([[[1.0, 1, 0], [1, 1, 0], [0, 0, 1]]]))
     assert not positive_definite(singular).item()
@@ -70,7 +72,10 @@ def test_inverse_of_needles_survives_float32():
 
 
 def test_information_form_is_filterpys(dtype):
-    prior, measured = (Gaussian(torch.randn(1, 3, generator=torch.Generator().manual_seed(s)).to(dtype), random_spd(1, s, dtype)) for s in (3, 4))
+    prior, measured = (
+        Gaussian(torch.randn(1, 3, generator=torch.Generator().manual_seed(s)).to(dtype), random_spd(1, s, dtype))
+        for s in (3, 4)
+    )
     a, b = information_from_gaussian(prior), information_from_gaussian(measured)
     fused = gaussian_from_information(type(a)(a.vector + b.vector, a.matrix + b.matrix))
     peer = InformationFilter(3, 3)

@@ -46,8 +46,22 @@ def test_both_axes_meet_at_the_fixated_point(head, pan, tilt, distance):
 
 
 def test_unreachable_is_an_answer():
-    points = torch.tensor([[-1.0, 0, 0], [0, 0, 2], [0, 0, 0], [0.15, 0, 0.1], [1, 3, 0], [1, 0, 1], [1, 0, -2], [torch.nan, 0, 0],
-                           [torch.inf, 0, 0], [1, 0, 0]], dtype=torch.float64, requires_grad=True)
+    points = torch.tensor(
+        [
+            [-1.0, 0, 0],
+            [0, 0, 2],
+            [0, 0, 0],
+            [0.15, 0, 0.1],
+            [1, 3, 0],
+            [1, 0, 1],
+            [1, 0, -2],
+            [torch.nan, 0, 0],
+            [torch.inf, 0, 0],
+            [1, 0, 0],
+        ],
+        dtype=torch.float64,
+        requires_grad=True,
+    )
     gaze, reachable = fixate(VIZZY, points)
     assert reachable.tolist() == [False] * 9 + [True]
     for angle, limit in zip(gaze, (53, 37, 40), strict=True):
@@ -84,7 +98,16 @@ def test_clamp():
     assert [round(math.degrees(a.item()), 6) for a in clamped] == [53, -18, 0]
 
 
-@pytest.mark.parametrize(("setting", "value"), [("baseline_m", 0.0), ("pan_limit_deg", 190.0), ("tilt_down_deg", 90.0), ("vergence_max_deg", 0.0), ("eyes_up_m", math.inf)])
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("baseline_m", 0.0),
+        ("pan_limit_deg", 190.0),
+        ("tilt_down_deg", 90.0),
+        ("vergence_max_deg", 0.0),
+        ("eyes_up_m", math.inf),
+    ],
+)
 def test_errors_name_the_setting(setting, value):
     with pytest.raises(SettingError, match=f"head.{setting} = {value}"):
         Head(**{setting: value})

@@ -12,9 +12,9 @@ from scipy.optimize import least_squares
 
 from torchfovea.camera import Fisheye, Pinhole
 from torchfovea.chart import cartesian_from_inverse_range, inverse_range_coordinates
+from torchfovea.correspondence import Correspondences
 from torchfovea.gaussian import Gaussian, unpack
 from torchfovea.head import Eyes, Gaze, Head, eyes, fixate, to_ego
-from torchfovea.correspondence import Correspondences
 from torchfovea.setting import SettingError
 from torchfovea.triangulation import observe, sigma_root, triangulate, triangulate_homogeneous
 from torchfovea.unscented import SigmaPoints
@@ -34,7 +34,9 @@ def stereo(points: torch.Tensor, sigma: float, gaze: Gaze | None = None, camera=
     return Correspondences(left, right, spread, spread, torch.ones(points.shape[:-1], dtype=torch.bool)), pose
 
 
-def cloud(count: int, seed: int, dtype: torch.dtype = torch.float64, nearest: float = 0.5, farthest: float = 4.0) -> torch.Tensor:
+def cloud(
+    count: int, seed: int, dtype: torch.dtype = torch.float64, nearest: float = 0.5, farthest: float = 4.0
+) -> torch.Tensor:
     rng = torch.Generator().manual_seed(seed)
     u = torch.rand(count, 3, generator=rng, dtype=torch.float64)
     x = nearest + (farthest - nearest) * u[:, 0]
@@ -74,8 +76,13 @@ def test_agrees_with_kornia_on_exact_matches():
     points = cloud(30, 3)
     matches, pose = stereo(points, 0.1)
     k = torch.diag(torch.tensor([CAMERA.focal_px, CAMERA.focal_px, 1.0], dtype=torch.float64))
-    projections = [k @ torch.cat([r.mT, -(r.mT @ t)[:, None]], -1) for r, t in ((pose.R_left, pose.t_left), (pose.R_right, pose.t_right))]
-    peer = triangulate_points(projections[0][None], projections[1][None], matches.left_px[None], matches.right_px[None])[0]
+    projections = [
+        k @ torch.cat([r.mT, -(r.mT @ t)[:, None]], -1)
+        for r, t in ((pose.R_left, pose.t_left), (pose.R_right, pose.t_right))
+    ]
+    peer = triangulate_points(
+        projections[0][None], projections[1][None], matches.left_px[None], matches.right_px[None]
+    )[0]
     observed = observe(matches, pose, CAMERA, HALF, SigmaPoints(), "cartesian")
     torch.testing.assert_close(observed.mean, peer, rtol=2e-2, atol=2e-3)  # the UT's mean adds the curvature of 1/D
 
@@ -123,7 +130,9 @@ def test_moments_match_monte_carlo(chart, camera):
         want = np.cov(sample[:, i].numpy().T)
         scale = np.sqrt(np.outer(np.diag(want), np.diag(want)))
         np.testing.assert_allclose((unpack(observed.cov[i]).numpy() - want) / scale, 0, atol=0.02)
-        np.testing.assert_allclose((observed.mean[i].numpy() - sample[:, i].mean(0).numpy()) / np.sqrt(np.diag(want)), 0, atol=0.02)
+        np.testing.assert_allclose(
+            (observed.mean[i].numpy() - sample[:, i].mean(0).numpy()) / np.sqrt(np.diag(want)), 0, atol=0.02
+        )
 
 
 def test_charts_agree_to_first_order():
@@ -142,15 +151,24 @@ def test_infinity_is_an_ordinary_place_in_inverse_range_only():
     inverse, cartesian = (observe(matches, pose, CAMERA, HALF, chart=c) for c in ("inverse_range", "cartesian"))
     assert inverse.valid.item() and not cartesian.valid.item()
     # σ of 1/r: disparity noise √2 0.2 px over f b
-    assert inverse.cov[0, 5].sqrt().item() == pytest.approx(0.2 * math.sqrt(2) / CAMERA.focal_px / HEAD.baseline_m, rel=0.05)
+    assert inverse.cov[0, 5].sqrt().item() == pytest.approx(
+        0.2 * math.sqrt(2) / CAMERA.focal_px / HEAD.baseline_m, rel=0.05
+    )
 
 
 def test_invalid_is_finite_and_float32_is_float64():
     matches, pose = stereo(cloud(40, 2), 0.1)
-    broken = matches._replace(valid=torch.arange(40) % 2 == 0, right_sigma_px=torch.where(torch.arange(40) == 4, 0.0, matches.right_sigma_px))
+    broken = matches._replace(
+        valid=torch.arange(40) % 2 == 0, right_sigma_px=torch.where(torch.arange(40) == 4, 0.0, matches.right_sigma_px)
+    )
     observed = observe(broken, pose, CAMERA, HALF)
     assert observed.valid.sum() == 19 and all(bool(torch.isfinite(x).all()) for x in observed)
-    single = observe(Correspondences(*(x.float() if x.is_floating_point() else x for x in matches)), Eyes(*(x.float() for x in pose)), CAMERA, HALF)
+    single = observe(
+        Correspondences(*(x.float() if x.is_floating_point() else x for x in matches)),
+        Eyes(*(x.float() for x in pose)),
+        CAMERA,
+        HALF,
+    )
     double = observe(matches, pose, CAMERA, HALF)
     assert single.mean.dtype == torch.float32
     torch.testing.assert_close(single.mean.double(), double.mean, rtol=1e-3, atol=1e-3)
@@ -173,7 +191,9 @@ def test_gradients(chart):
     matches, pose = stereo(cloud(3, 1, farthest=1.5), 0.1)
 
     def through(left, right, sigma):
-        o = observe(matches._replace(left_px=left, right_px=right, left_sigma_px=sigma), pose, CAMERA, HALF, chart=chart)
+        o = observe(
+            matches._replace(left_px=left, right_px=right, left_sigma_px=sigma), pose, CAMERA, HALF, chart=chart
+        )
         return o.mean, o.cov
 
     inputs = (matches.left_px, matches.right_px, matches.left_sigma_px)

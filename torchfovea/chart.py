@@ -1,13 +1,13 @@
 """Two coordinate systems for a point seen from the ego frame, and Gaussians carried between them.
 
-`cartesian` is (x, y, z). `inverse_range` is (a, b, ρ) about a nominal unit direction n: two bearing offsets on the plane
-that touches the sphere at n, and the inverse range,
+`cartesian` is (x, y, z). `inverse_range` is (a, b, ρ) about a nominal unit direction n: two bearing offsets on the
+plane that touches the sphere at n, and the inverse range,
 
     X = u / ρ,   u = (n + a e₁ + b e₂) / √(1 + a² + b²),
 
-after the inverse-depth parametrization of Civera, Davison, Montiel (2008). Retinal noise is Gaussian in the retinas, hence
-nearly Gaussian here, and badly skewed in range. A negative ρ is a point beyond infinity: noise puts far points there, and
-averaging is unbiased only if it is kept.
+after the inverse-depth parametrization of Civera, Davison, Montiel (2008). Retinal noise is Gaussian in the retinas,
+hence nearly Gaussian here, and badly skewed in range. A negative ρ is a point beyond infinity: noise puts far points
+there, and averaging is unbiased only if it is kept.
 """
 
 from __future__ import annotations

@@ -34,6 +34,11 @@ COMMANDS: dict[str, Command] = {
         "find the nearest object by saccades, and map the scene: the main job",
         "torchfovea search scene=cans sensor=uniform acquisition.alpha=2",
     ),
+    "sense": Command(
+        "torchfovea.experiments.sense:run",
+        "a stereo pair in, 3-D points with covariances out",
+        "torchfovea sense pair=motorcycle",
+    ),
     "doctor": Command("torchfovea.doctor:run", "what this machine can render and has", "torchfovea doctor"),
 }
 

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from torchfovea.head import Gaze, eyes
 from torchfovea.correspondence import Correspondences
+from torchfovea.head import Gaze, eyes
 from torchfovea.metrics import gap, global_information, local_information, near_target, regret, saccades_to_target
 from torchfovea.perception import Mind, Observer, Step, decide, perceive
 from torchfovea.setting import require
@@ -211,4 +211,3 @@ def _target_error(step: Step, truth: Truth) -> float | None:
         return None
     best = torch.where(eligible, step.reward.mean, torch.full_like(step.reward.mean, -torch.inf)).argmax()
     return float((step.points.mean[best] - truth.nearest_point).norm())
-

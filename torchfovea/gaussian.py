@@ -1,8 +1,8 @@
 """Gaussians of three dimensions in moment and in information form, and the symmetric 3x3 algebra they need.
 
-Layout. Tensors keep the component axis last in shape, but outermost in memory (a structure of arrays, see `columns`), so
-that `x.unbind(-1)` gives contiguous components and every formula below runs at the speed of memory. A symmetric matrix is
-packed into six columns in the order (xx, xy, xz, yy, yz, zz).
+Layout. Tensors keep the component axis last in shape, but outermost in memory (a structure of arrays, see `columns`),
+so that `x.unbind(-1)` gives contiguous components and every formula below runs at the speed of memory. A symmetric
+matrix is packed into six columns in the order (xx, xy, xz, yy, yz, zz).
 
 All functions broadcast over leading axes and are differentiable in every tensor argument.
 """

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from torchfovea.camera import Camera
+from torchfovea.correspondence import Budget, Correspondences, eye_sigma_px
 from torchfovea.gaussian import columns
 from torchfovea.head import Eyes, to_ego
-from torchfovea.correspondence import Budget, Correspondences, eye_sigma_px
-from torchfovea.retina import LogPolar, Uniform
+from torchfovea.layout import Retina
 
 __all__ = ["correspond_points"]
 
@@ -20,7 +20,7 @@ def correspond_points(
     left_px: Tensor,
     eyes: Eyes,
     camera: Camera,
-    retina: LogPolar | Uniform,
+    retina: Retina,
     budget: Budget,
     generator: torch.Generator | None,
 ) -> Correspondences:

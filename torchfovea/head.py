@@ -79,13 +79,17 @@ class Head:
         require(self.baseline_m > 0, "head.baseline_m", self.baseline_m, "a positive distance in metres")
         require(0 < self.pan_limit_deg < 180, "head.pan_limit_deg", self.pan_limit_deg, "between 0 and 180 degrees")
         for name in ("tilt_up_deg", "tilt_down_deg"):
-            require(0 <= getattr(self, name) < 90, f"head.{name}", getattr(self, name), "from 0 to less than 90 degrees")
+            require(
+                0 <= getattr(self, name) < 90, f"head.{name}", getattr(self, name), "from 0 to less than 90 degrees"
+            )
         require(self.tilt_up_deg + self.tilt_down_deg > 0, "head.tilt_down_deg", self.tilt_down_deg, "some tilt range")
         require(
             0 < self.vergence_max_deg < 180, "head.vergence_max_deg", self.vergence_max_deg, "between 0 and 180 degrees"
         )
         for name in ("eyes_forward_m", "eyes_up_m", "ego_height_m"):
-            require(math.isfinite(getattr(self, name)), f"head.{name}", getattr(self, name), "a finite length in metres")
+            require(
+                math.isfinite(getattr(self, name)), f"head.{name}", getattr(self, name), "a finite length in metres"
+            )
 
 
 def _rotation(rows: tuple[tuple[Tensor, ...], ...]) -> Tensor:
@@ -97,7 +101,8 @@ def cyclopean(head: Head, gaze: Gaze) -> tuple[Tensor, Tensor]:
     """Pose of the cyclopean frame in E.
 
     Returns:
-        R (..., 3, 3), whose columns are C's x (right), y (down) and z (forward) axes in E, and its origin t (..., 3) [m].
+        R (..., 3, 3), whose columns are C's x (right), y (down) and z (forward) axes in E, and its origin
+        t (..., 3) [m].
 
     Differentiable in the gaze.
     """
@@ -184,4 +189,3 @@ def clamp_gaze(head: Head, gaze: Gaze) -> Gaze:
         math.radians(a) for a in (head.pan_limit_deg, head.tilt_up_deg, head.tilt_down_deg, head.vergence_max_deg)
     )
     return Gaze(gaze.pan.clamp(-pan, pan), gaze.tilt.clamp(-up, down), gaze.vergence.clamp(0.0, widest))
-

@@ -12,12 +12,12 @@ from torch import Tensor
 from torchfovea.acquisition import choose, upper_confidence_bound
 from torchfovea.camera import Camera, Pinhole
 from torchfovea.chart import cartesian_from_inverse_range
+from torchfovea.correspondence import Budget, Correspondences
 from torchfovea.egosphere import EgoSphere, Fusion, Prior, belief, new_egosphere, remember
 from torchfovea.gaussian import Gaussian
 from torchfovea.head import Eyes, Gaze, Head, fixate
-from torchfovea.correspondence import Budget, Correspondences
+from torchfovea.layout import LogPolar, Retina
 from torchfovea.nearest import CellIndex, build_index, neighbour_spacing_rad
-from torchfovea.retina import LogPolar, Uniform
 from torchfovea.reward import RewardBelief, inverse_range_from_range, range_from_inverse_range, range_reward
 from torchfovea.setting import require
 from torchfovea.triangulation import observe
@@ -70,7 +70,7 @@ class Observer:
 
     head: Head = field(default_factory=Head)
     camera: Camera = field(default_factory=lambda: Pinhole.from_fov(135.0, 100.0))
-    retina: LogPolar | Uniform = field(default_factory=LogPolar)
+    retina: Retina = field(default_factory=LogPolar)
     budget: Budget = field(default_factory=Budget)
     points: SigmaPoints = field(default_factory=SigmaPoints)
     rotated: bool = True
@@ -90,12 +90,12 @@ class Mind(NamedTuple):
 
     Attributes:
         memory: the ego-sphere.
-        index: of its cells.
+        lookup: finds the cell of a direction.
         spacing_rad: distance of each cell to its neighbours, (..., Nx).
     """
 
     memory: EgoSphere
-    index: CellIndex
+    lookup: CellIndex
     spacing_rad: Tensor
 
 
@@ -140,8 +140,10 @@ def perceive(
     Differentiable in the correspondences.
     """
     support = observer.retina.width_px(matches.left_px) / 2
-    observed = observe(matches, eyes, observer.camera, support, observer.points, observer.fusion.chart, observer.rotated)
-    memory = remember(mind.memory, mind.index, mind.spacing_rad, observed, observer.fusion, common)
+    observed = observe(
+        matches, eyes, observer.camera, support, observer.points, observer.fusion.chart, observer.rotated
+    )
+    memory = remember(mind.memory, mind.lookup, mind.spacing_rad, observed, observer.fusion, common)
     return mind._replace(memory=memory)
 
 

@@ -11,17 +11,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchfovea.correspondence import Disparity
 from torchfovea.episode import Episode
 from torchfovea.files import write_figure
 from torchfovea.layout import Retina
 from torchfovea.metrics import information
 from torchfovea.retina import fovea, reconstruct
+from torchfovea.triangulation import Observations
 
 matplotlib.use("Agg")
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-__all__ = ["draw_episode", "sphere_map"]
+__all__ = ["draw_episode", "draw_sense", "sphere_map"]
 
 DARK = "0.15"
 
@@ -61,10 +63,19 @@ def _scan_path(axes: Axes, episode: Episode) -> None:
     elevation = torch.rad2deg(torch.asin(episode.direction[:, 2].clamp(-1, 1)))
     axes.plot(azimuth, elevation, "-", color="white", lw=2.2, alpha=0.8)
     axes.plot(azimuth, elevation, "-", color=DARK, lw=0.9)
-    axes.scatter(azimuth, elevation, c=np.arange(len(azimuth)), cmap="autumn", s=26, edgecolors=DARK, linewidths=0.6, zorder=3)
+    axes.scatter(
+        azimuth, elevation, c=np.arange(len(azimuth)), cmap="autumn", s=26, edgecolors=DARK, linewidths=0.6, zorder=3
+    )
     for k in range(min(len(azimuth), 6)):
-        axes.annotate(str(k), (azimuth[k], elevation[k]), textcoords="offset points", xytext=(5, 4), fontsize=8, color="white",
-                      bbox={"boxstyle": "round,pad=0.12", "fc": DARK, "ec": "none", "alpha": 0.75})
+        axes.annotate(
+            str(k),
+            (azimuth[k], elevation[k]),
+            textcoords="offset points",
+            xytext=(5, 4),
+            fontsize=8,
+            color="white",
+            bbox={"boxstyle": "round,pad=0.12", "fc": DARK, "ec": "none", "alpha": 0.75},
+        )
 
 
 def draw_episode(path: Path, episode: Episode, retina: Retina, title: str) -> None:
@@ -84,8 +95,12 @@ def draw_episode(path: Path, episode: Episode, retina: Retina, title: str) -> No
     if shown is not None:
         row = next(parts).subplots(1, 4)
         left, right = shown.left.detach().cpu().float(), shown.right.detach().cpu().float()
-        for axes, picture, name in zip(row, (left.movedim(0, -1), right.movedim(0, -1), _kept(left, retina)),
-                                       ("left eye", "right eye", "what the left retina keeps"), strict=False):
+        for axes, picture, name in zip(
+            row,
+            (left.movedim(0, -1), right.movedim(0, -1), _kept(left, retina)),
+            ("left eye", "right eye", "what the left retina keeps"),
+            strict=False,
+        ):
             axes.imshow(np.asarray(picture).clip(0, 1))
             axes.set_title(f"{name} (last fixation at +)")
             _cross(axes, np.asarray(picture).shape[:2])
@@ -123,4 +138,43 @@ def draw_episode(path: Path, episode: Episode, retina: Retina, title: str) -> No
     for axes in row:
         axes.set_xlabel("fixation t")
         axes.grid(alpha=0.3)
+    write_figure(path, figure, dpi=80)
+
+
+def draw_sense(path: Path, left: Tensor, disparity: Disparity, observed: Observations, px: Tensor) -> None:
+    """Draw a sensed pair: the left image, the disparity, each point's range and its relative uncertainty.
+
+    Args:
+        path: the PNG to write.
+        left: (3, H, W).
+        disparity: what the matcher found.
+        observed: in inverse range.
+        px: the receptive fields, (N, 2), for the two maps.
+    """
+    figure = Figure(figsize=(17, 9.5), layout="constrained")
+    axes = figure.subplots(2, 2)
+    axes[0, 0].imshow(np.asarray(left.movedim(0, -1)).clip(0, 1))
+    axes[0, 0].set_title("left image")
+    values = np.where(np.asarray(disparity.valid), np.asarray(disparity.disparity), np.nan)
+    figure.colorbar(axes[0, 1].imshow(values, cmap="viridis"), ax=axes[0, 1], label="px")
+    axes[0, 1].set_title("disparity of what the retina keeps")
+    keep = observed.valid & (observed.mean[:, 2] > 0)
+    rho, sigma = observed.mean[keep, 2], observed.cov[keep, 5].sqrt()
+    maps = (
+        (1 / rho, "range", "m", "viridis_r", False),
+        (sigma / rho, "standard deviation of the inverse range over itself", "", "magma", True),
+    )
+    for place, (value, name, unit, cmap, log) in zip(axes[1], maps, strict=True):
+        low, high = (
+            (float(q) for q in torch.quantile(value.double(), torch.tensor([0.02, 0.98], dtype=torch.float64)))
+            if len(value)
+            else (0.0, 1.0)
+        )
+        drawn = place.scatter(
+            *px[keep].T, c=value, s=1.5, cmap=cmap, linewidths=0, norm="log" if log else None, rasterized=True
+        )
+        drawn.set_clim(low, max(high, low * 1.001 + 1e-9))
+        place.set(title=name, aspect="equal", facecolor="0.9")
+        place.invert_yaxis()
+        figure.colorbar(drawn, ax=place, label=unit)
     write_figure(path, figure, dpi=80)

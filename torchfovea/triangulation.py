@@ -9,9 +9,9 @@ from torch import Tensor
 
 from torchfovea.camera import Camera
 from torchfovea.chart import inverse_range_coordinates
+from torchfovea.correspondence import Correspondences
 from torchfovea.gaussian import columns, positive_definite
 from torchfovea.head import Eyes, to_ego
-from torchfovea.correspondence import Correspondences
 from torchfovea.setting import require
 from torchfovea.unscented import SigmaPoints, unscented_transform
 
@@ -73,11 +73,13 @@ def triangulate(left: Tensor, right: Tensor, t_left: Tensor, t_right: Tensor) ->
     return torch.where(in_front[..., None], point, torch.ones_like(point)), in_front
 
 
-def triangulate_homogeneous(left: Tensor, right: Tensor, t_left: Tensor, t_right: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def triangulate_homogeneous(
+    left: Tensor, right: Tensor, t_left: Tensor, t_right: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     """The midpoint method on the rays' common epipolar plane, as a homogeneous point.
 
-    With the plane's normal m = b × (dₗ + dᵣ) for unit rays, s = (b × dᵣ)·m/(c·m) and t = (b × dₗ)·m/(c·m). The two agree
-    with `triangulate` where the rays meet, but numerator and denominator stay finite and keep their signs through
+    With the plane's normal m = b × (dₗ + dᵣ) for unit rays, s = (b × dᵣ)·m/(c·m) and t = (b × dₗ)·m/(c·m). The two
+    agree with `triangulate` where the rays meet, but numerator and denominator stay finite and keep their signs through
     parallel rays, where the shortest segment between skew rays would jump toward the eyes.
 
     Args:
@@ -123,7 +125,12 @@ def sigma_root(left_sigma: Tensor, right_sigma: Tensor, rotated: bool = True) ->
     else:
         scale = (left_sigma * left_sigma + right_sigma * right_sigma).rsqrt()
         left, right, both = left_sigma**2 * scale, -(right_sigma**2) * scale, left_sigma * right_sigma * scale
-        rows = [[left, both, zero, zero], [zero, zero, left, both], [right, both, zero, zero], [zero, zero, right, both]]
+        rows = [
+            [left, both, zero, zero],
+            [zero, zero, left, both],
+            [right, both, zero, zero],
+            [zero, zero, right, both],
+        ]
     flat = [entry for row in rows for entry in row]
     return columns(*flat).unflatten(-1, (4, 4))
 
@@ -136,21 +143,23 @@ def observe(
     points: SigmaPoints | None = None,
     chart: str = "inverse_range",
     rotated: bool = True,
+    right_camera: Camera | None = None,
 ) -> Observations:
-    """Correspondences as Gaussian points in the ego frame: the unscented transform through triangulation (Eq. 6-18, 22-27).
+    """Correspondences as Gaussian points in E: the unscented transform through triangulation (Eq. 6-18, 22-27).
 
     Args:
         matches: correspondences (..., N) with their retinal standard deviations.
         eyes: poses of the cameras in E, (...).
-        camera: both eyes' camera, in retinal pixels.
+        camera: both eyes' camera, or the left one's, in retinal pixels.
         support_px: half the width of each left receptive field, (..., N) or (N,) [px].
         points: sigma points of four dimensions; None: `SigmaPoints()`.
         chart: `inverse_range` or `cartesian`.
         rotated: see `sigma_root`.
+        right_camera: where the right eye has another.
 
     Returns:
-        Observations. Valid are those whose nine sigma points all lie in front of both eyes (in inverse range: whose rays
-        look ahead, for infinity is an ordinary place there) and whose covariance is positive definite.
+        Observations. Valid are those whose nine sigma points all lie in front of both eyes (in inverse range: whose
+        rays look ahead, for infinity is an ordinary place there) and whose covariance is positive definite.
 
     Raises:
         SettingError: for an unknown chart.
@@ -163,7 +172,7 @@ def observe(
     t_left, t_right = eyes.t_left.unsqueeze(-2), eyes.t_right.unsqueeze(-2)
 
     def rays(px: Tensor) -> tuple[Tensor, Tensor]:
-        left, right = camera.rays(px[..., :2]), camera.rays(px[..., 2:])
+        left, right = camera.rays(px[..., :2]), (right_camera or camera).rays(px[..., 2:])
         return to_ego(eyes.R_left, left), to_ego(eyes.R_right, right)
 
     in_front = torch.ones((), dtype=torch.bool)

@@ -95,7 +95,12 @@ def unscented_transform(
     step = points.spread * root
     x = mean.unbind(-1)
     sigma = columns(
-        *(torch.stack([x[i], *(x[i] + step[..., i, j] for j in range(n)), *(x[i] - step[..., i, j] for j in range(n))]) for i in range(n))
+        *(
+            torch.stack(
+                [x[i], *(x[i] + step[..., i, j] for j in range(n)), *(x[i] - step[..., i, j] for j in range(n))]
+            )
+            for i in range(n)
+        )
     )
     image = function(sigma)
     delta = (image - image[0]).unbind(-1)
@@ -112,5 +117,7 @@ def unscented_transform(
         for j in range(i, m):
             # Σ w (δi − si)(δj − sj) = Σ w δi δj − sj Σ w δi − si Σ w δj + si sj Σ w
             other = first if j == i else torch.tensordot(w, delta[j], 1)
-            packed.append((weighted * delta[j]).sum(0) - shift[j] * first - shift[i] * other + total * shift[i] * shift[j])
+            packed.append(
+                (weighted * delta[j]).sum(0) - shift[j] * first - shift[i] * other + total * shift[i] * shift[j]
+            )
     return image[0] + columns(*shift), columns(*packed), image

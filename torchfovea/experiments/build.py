@@ -1,10 +1,10 @@
-"""From a composed configuration to the library's dataclasses, with every value checked under the name the user knows."""
+"""From a composed configuration to the library's dataclasses, each value checked under the name the user knows."""
 
 from __future__ import annotations
 
 import dataclasses
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar, cast
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -12,13 +12,13 @@ from torch import Tensor
 
 from torchfovea import acquisition, sphere
 from torchfovea.camera import Camera, Fisheye, Pinhole
+from torchfovea.correspondence import Budget
 from torchfovea.egosphere import Fusion, Prior
 from torchfovea.head import Head, fixate
 from torchfovea.layout import LogPolar, Retina, Uniform
-from torchfovea.correspondence import Budget
 from torchfovea.perception import Acquisition, Eligibility, Observer
-from torchfovea.sgbm import SGBM
 from torchfovea.setting import SettingError, require
+from torchfovea.sgbm import SGBM
 from torchfovea.sim.arena import Arena
 from torchfovea.sim.scene import AttentionWorld, Cans, Room, build_scene
 from torchfovea.sim.world import World
@@ -75,7 +75,12 @@ def _typed(value: Any, kind: str, setting: str) -> Any:
     if kind == "int":
         require(number and float(value).is_integer(), setting, value, "a whole number")
         return int(value)
-    require(kind not in ("bool", "str") or type(value).__name__ == kind, setting, value, {"bool": "true or false"}.get(kind, "a word"))
+    require(
+        kind not in ("bool", "str") or type(value).__name__ == kind,
+        setting,
+        value,
+        {"bool": "true or false"}.get(kind, "a word"),
+    )
     return value
 
 
@@ -107,7 +112,9 @@ def build_sensor(cfg: DictConfig) -> tuple[Camera, Retina]:
     fov_deg = _typed(cfg.sensor.fov_deg, "float", "sensor.fov_deg")
     widest = 180 if kind == "pinhole" else 360
     require(0 < fov_deg < widest, "sensor.fov_deg", fov_deg, f"more than 0 and less than {widest} for a {kind} camera")
-    retina = construct(LogPolar if layout == "log_polar" else Uniform, cfg.sensor, "sensor")
+    retina: Retina = (
+        construct(LogPolar, cfg.sensor, "sensor") if layout == "log_polar" else construct(Uniform, cfg.sensor, "sensor")
+    )
     return (Pinhole if kind == "pinhole" else Fisheye).from_fov(fov_deg, retina.radius_px), retina
 
 
@@ -115,8 +122,12 @@ def build_acquisition(cfg: DictConfig) -> Acquisition:
     """The acquisition function by its name."""
     name = choice(cfg, "acquisition.name", ("ucb", "pi", "ei", "log_ei"))
     if name != "ucb":
-        full = {"pi": "log_probability_of_improvement", "ei": "expected_improvement", "log_ei": "log_expected_improvement"}
-        return getattr(acquisition, full[name])  # type: ignore[no-any-return]
+        full = {
+            "pi": "log_probability_of_improvement",
+            "ei": "expected_improvement",
+            "log_ei": "log_expected_improvement",
+        }
+        return getattr(acquisition, full[name])
     alpha = _typed(cfg.acquisition.alpha, "float", "acquisition.alpha")
     require(alpha >= 0, "acquisition.alpha", alpha, "a number not below 0; inf is allowed")
     return partial(_bound, alpha=alpha)
@@ -134,7 +145,11 @@ def build_observer(cfg: DictConfig) -> Observer:
         head=construct(Head, cfg.head, "head"),
         camera=camera,
         retina=retina,
-        budget=construct(Budget, {**cfg.budget, "source_px": whole(cfg, "sensor.source_px", 16) if cfg.budget.source else None}, "budget"),
+        budget=construct(
+            Budget,
+            {**cfg.budget, "source_px": whole(cfg, "sensor.source_px", 16) if cfg.budget.source else None},
+            "budget",
+        ),
         points=SigmaPoints.paper() if printed else SigmaPoints(),
         rotated=not printed,
         fusion=construct(Fusion, cfg.fusion, "fusion"),
@@ -175,20 +190,20 @@ def build_cells(cfg: DictConfig, head: Head, generator: torch.Generator, dtype: 
     return sphere.sample(mixture, count, generator, reachable).to(dtype)
 
 
-
-
 def build_arena(cfg: DictConfig, observer: Observer, seed: int) -> Arena:
     """The simulated world of an episode."""
-    kind = {"attention_world": AttentionWorld, "cans": Cans}[choice(cfg, "scene.name", ("attention_world", "cans"))]
+    name = choice(cfg, "scene.name", ("attention_world", "cans"))
     room = construct(Room, cfg.scene.room, "scene.room") if "room" in cfg.scene else Room()
     fields = {key: value for key, value in cfg.scene.items() if key not in ("name", "room")}
-    params = construct(kind, {**fields, "room": room}, "scene")
-    scene = build_scene(params, seed, observer.head)
+    params = (
+        construct(AttentionWorld, fields, "scene") if name == "attention_world" else construct(Cans, fields, "scene")
+    )
+    scene = build_scene(dataclasses.replace(params, room=room), seed, observer.head)
     fidelity = choice(cfg, "fidelity", ("photometric", "geometric"))
     world = World(
         scene,
-        renderer=choice(cfg, "renderer.name", ("rays", "gl")),
-        motor=choice(cfg, "motor", ("instant", "physics")),
+        renderer=cast(Literal["rays", "gl"], choice(cfg, "renderer.name", ("rays", "gl"))),
+        motor=cast(Literal["instant", "physics"], choice(cfg, "motor", ("instant", "physics"))),
         camera=observer.camera,
         source_px=whole(cfg, "sensor.source_px", 16),
         radius_px=observer.retina.radius_px,

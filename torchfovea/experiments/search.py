@@ -39,7 +39,13 @@ def run(cfg: DictConfig) -> float:
     rows: list[tuple[Any, ...]] = []
     steps: list[tuple[Any, ...]] = []
     last: Episode | None = None
-    bars = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    bars = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
     with Progress(*bars, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("search", total=episodes * saccades)
         for k in range(episodes):
@@ -91,7 +97,9 @@ def summarize(rows: list[tuple[Any, ...]]) -> dict[str, Any]:
     for name, values in zip(EPISODE_COLUMNS[2:], list(zip(*rows, strict=True))[2:], strict=True):
         known = [v for v in values if v is not None]
         figures[name] = statistics.fmean(known) if known else None
-    figures["saccades_to_target_median"] = statistics.median(row[EPISODE_COLUMNS.index("saccades_to_target")] for row in rows)
+    figures["saccades_to_target_median"] = statistics.median(
+        row[EPISODE_COLUMNS.index("saccades_to_target")] for row in rows
+    )
     figures["episodes"] = len(rows)
     return figures
 
@@ -101,7 +109,12 @@ def _draw(folder: Path, cfg: DictConfig, retina: Any, episode: Episode, row: tup
 
     moves = row[EPISODE_COLUMNS.index("saccades_to_target")]
     outcome = f"target fixated after {moves} saccades" if bool(episode.hit.any()) else "target not found"
-    draw_episode(folder / "episode.png", episode, retina, f"{cfg.scene.name}, {cfg.sensor.layout}, {cfg.sensor.fov_deg:g}°: {outcome}")
+    draw_episode(
+        folder / "episode.png",
+        episode,
+        retina,
+        f"{cfg.scene.name}, {cfg.sensor.layout}, {cfg.sensor.fov_deg:g}°: {outcome}",
+    )
 
 
 def _print(figures: dict[str, Any]) -> None:

@@ -1,0 +1,187 @@
+"""The step and the episode in a world of spheres whose rays are known in closed form."""
+
+import math
+from functools import partial
+
+import pytest
+import torch
+
+from torchfovea.acquisition import expected_improvement, log_probability_of_improvement, upper_confidence_bound
+from torchfovea.camera import Pinhole
+from torchfovea.correspondence import Budget, Correspondences
+from torchfovea.egosphere import Fusion, Prior
+from torchfovea.episode import Fixation, Look, Move, Truth, run_episode
+from torchfovea.geometric import correspond_points
+from torchfovea.head import Gaze, Head, clamp_gaze, cyclopean, eyes, fixate, to_ego
+from torchfovea.layout import LogPolar, Uniform
+from torchfovea.perception import Eligibility, Observer, decide, new_mind, perceive
+from torchfovea.setting import SettingError
+from torchfovea.sphere import fibonacci_directions
+from torchfovea.unscented import SigmaPoints
+
+HEAD = Head()
+ROOM_M = 3.0
+BALL, RADIUS_M = torch.tensor([0.6, 0.5, -0.1], dtype=torch.float64), 0.12
+
+
+def bound(mean, std, incumbent, alpha):
+    return upper_confidence_bound(mean, std, alpha)
+
+
+def meet(origin: torch.Tensor, direction: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """First surface on rays (..., 3): the ball or the room around E; the point and whether it is the ball."""
+    direction = direction / direction.norm(dim=-1, keepdim=True)
+    shift = origin - BALL
+    b = (shift * direction).sum(-1)
+    root = b * b - (shift * shift).sum(-1) + RADIUS_M**2
+    near = -b - root.clamp(min=0).sqrt()
+    ball = (root > 0) & (near > 0)
+    b = (origin * direction).sum(-1)
+    far = -b + (b * b - (origin * origin).sum(-1) + ROOM_M**2).sqrt()
+    return origin + torch.where(ball, near, far)[..., None] * direction, ball
+
+
+class Spheres:
+    """A ball in a spherical room."""
+
+    def __init__(self, observer: Observer) -> None:
+        self.observer = observer
+
+    def saccade(self, gaze: Gaze) -> Move:
+        return Move(clamp_gaze(HEAD, Gaze(*(a.double() for a in gaze))), 0.1, 1.0)
+
+    def look(self, gaze: Gaze, generator: torch.Generator) -> Look:
+        o, dtype = self.observer, gaze.pan.dtype
+        pose = eyes(HEAD, gaze)
+        px = o.retina.centers_px(dtype=dtype)
+        points, _ = meet(pose.t_left.double(), to_ego(pose.R_left, o.camera.rays(px)).double())
+        again, _ = meet(pose.t_right.double(), points - pose.t_right.double())
+        visible = (again - points).norm(dim=-1) < 1e-6
+        return Look(correspond_points(points.to(dtype), visible, px, pose, o.camera, o.retina, o.budget, generator))
+
+    def fixation(self, gaze: Gaze) -> Fixation:
+        rotation, origin = cyclopean(HEAD, Gaze(*(a.double() for a in gaze)))
+        point, ball = meet(origin, rotation[:, 2])
+        return Fixation(point, float(point.norm()), False, bool(ball))
+
+    def truth(self, cells: torch.Tensor) -> Truth:
+        nearest = BALL * (1 - RADIUS_M / BALL.norm())
+        points, _ = meet(torch.zeros(3, dtype=torch.float64), cells.double())
+        return Truth(float(nearest.norm()), nearest.to(cells), points.to(cells))
+
+
+def small(**changes) -> Observer:
+    settings = {"camera": Pinhole.from_fov(90, 100), "retina": LogPolar(3000), **changes}
+    return Observer(head=HEAD, **settings)
+
+
+def cells_in_reach(count: int, dtype=torch.float64) -> torch.Tensor:
+    directions = fibonacci_directions(count, dtype)
+    return directions[fixate(HEAD, directions)[1]]
+
+
+def run(observer: Observer, seed: int = 0, saccades: int = 8, dtype=torch.float64, cells: int = 6000):
+    arena, mind = Spheres(observer), new_mind(observer, cells_in_reach(cells, dtype))
+    generator = torch.Generator().manual_seed(seed)
+    return run_episode(observer, mind, arena, arena.truth(mind.memory.cells), saccades, generator)
+
+
+@pytest.mark.parametrize("retina", [LogPolar(3000), Uniform(3000)], ids=["log_polar", "uniform"])
+@pytest.mark.parametrize(
+    "acquisition", [partial(bound, alpha=1.0), log_probability_of_improvement, expected_improvement]
+)
+def test_finds_the_ball(retina, acquisition):
+    episode = run(small(retina=retina, acquisition=acquisition))
+    assert bool(episode.hit.any()) and episode.moves <= 7
+    assert episode.gap[-1] > 0.9 and episode.target_error_m < 0.05
+    assert bool((episode.gap.diff() >= 0).all()) and bool((episode.global_information.diff() > 0).all())
+
+
+@pytest.mark.parametrize("name", ["printed", "aligned"])
+def test_the_other_fusions_run_to_the_end(name):
+    fusion = Fusion(name, slant=0.0 if name == "printed" else 1.0)
+    episode = run(
+        small(
+            fusion=fusion,
+            prior=Prior(4.0, 4.0),
+            reward="range",
+            points=SigmaPoints.paper(),
+            rotated=False,
+            budget=Budget.printed,
+        ),
+        saccades=4,
+    )
+    assert all(bool(torch.isfinite(x).all()) for x in (episode.gap, episode.regret, episode.global_information))
+
+
+def test_metrics_are_those_of_the_truth():
+    observer = small()
+    episode = run(observer, saccades=5)
+    best, reward = -(BALL.norm() - RADIUS_M).item(), episode.reward
+    for t in range(5):
+        gap = (reward[: t + 1].max() - reward[0]) / (best - reward[0])
+        assert episode.gap[t].item() == pytest.approx(min(1.0, gap.item()), abs=1e-6)
+        assert episode.regret[t].item() == pytest.approx(best - reward[: t + 1].mean().item(), abs=1e-6)
+    first = int(episode.hit.float().argmax()) if bool(episode.hit.any()) else 5
+    assert episode.moves == first
+    assert reward[0].item() == pytest.approx(-ROOM_M, abs=0.2)
+
+
+def test_same_seed_same_episode_and_another_seed_another():
+    observer = small()
+    one, two, other = run(observer, 3), run(observer, 3), run(observer, 4)
+    for a, b in zip(one.gaze, two.gaze, strict=True):
+        assert torch.equal(a, b)
+    assert torch.equal(one.global_information, two.global_information)
+    assert not torch.equal(one.global_information, other.global_information)
+
+
+def test_float32_follows_float64():
+    single, double = (run(small(), dtype=d, saccades=3) for d in (torch.float32, torch.float64))
+    assert single.step.points.mean.dtype == torch.float32
+    assert single.global_information[0].item() == pytest.approx(double.global_information[0].item(), abs=0.3)
+
+
+def test_ground_is_no_object_and_too_near_is_not_looked_at():
+    observer = small(eligibility=Eligibility(nearest_m=2.9, ground_z_m=-10))
+    assert not run(observer, saccades=4).hit.any()  # the ball is nearer than 2.9 m
+    ground = run(small(eligibility=Eligibility(ground_z_m=10)), saccades=2)
+    seen = ground.step.mind.memory.looks > 0
+    assert not (ground.step.eligible & seen).any()
+
+
+def test_nothing_seen_and_nothing_eligible():
+    observer = small()
+    mind = new_mind(observer, cells_in_reach(2000))
+    px = torch.zeros(5, 2, dtype=torch.float64)
+    blind = Correspondences(px, px, px[:, 0], px[:, 0], torch.zeros(5, dtype=torch.bool))
+    zero = torch.zeros((), dtype=torch.float64)
+    after = perceive(observer, mind, blind, eyes(HEAD, Gaze(zero, zero, zero)))
+    assert after.memory.looks.sum() == 0
+    step = decide(observer, after, torch.Generator().manual_seed(0))
+    assert step.cell >= 0 and bool(torch.isfinite(step.points.cov).all())
+    # ties among unseen cells are broken by the generator
+    others = {int(decide(observer, after, torch.Generator().manual_seed(s)).cell) for s in range(5)}
+    assert len(others) > 1
+    none = decide(small(eligibility=Eligibility(nearest_m=100)), after)
+    assert none.cell == -1 and none.gaze.pan == 0
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: run(small(), saccades=0), "saccades = 0"),
+        (lambda: small(reward="profit"), "reward = profit"),
+        (lambda: Eligibility(nearest_m=-1), "eligibility.nearest_m = -1"),
+        (lambda: new_mind(small(), torch.zeros(0, 3)), "cells"),
+    ],
+)
+def test_errors_name_the_setting(call, message):
+    with pytest.raises(SettingError, match=message):
+        call()
+
+
+def test_alpha_infinity_is_pure_exploration():
+    episode = run(small(acquisition=partial(bound, alpha=math.inf)), saccades=4)
+    greedy = run(small(acquisition=partial(bound, alpha=0.0)), saccades=4)
+    assert episode.global_information[-1] > greedy.global_information[-1]

@@ -1,0 +1,101 @@
+"""Reading what users have, images and disparities, and writing points for their viewers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchfovea.files import replacing
+from torchfovea.setting import SettingError, require
+
+__all__ = ["read_disparity", "read_image", "write_ply"]
+
+
+def _exists(path: Path, setting: str) -> None:
+    require(path.is_file(), setting, path, "an existing file")
+
+
+def read_image(path: Path, setting: str) -> Tensor:
+    """An image as (3, H, W) in [0, 1].
+
+    Args:
+        path: anything that OpenCV reads, or NPY and NPZ arrays (H, W) or (H, W, 3), bytes or in [0, 1].
+        setting: the name of the setting, for errors.
+
+    Raises:
+        SettingError: for a file that is missing or cannot be read.
+    """
+    import cv2
+
+    _exists(path, setting)
+    if path.suffix.lower() in (".npy", ".npz"):
+        pixels = _array(path, setting)
+        pixels = np.repeat(pixels[..., None], 3, -1) if pixels.ndim == 2 else pixels
+        require(pixels.ndim == 3 and pixels.shape[-1] == 3, setting, pixels.shape, "an array (H, W) or (H, W, 3)")
+    else:
+        loaded = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        if loaded is None:
+            raise SettingError(f"{setting} = {path}: expected an image that OpenCV can read")
+        pixels = cv2.cvtColor(loaded, cv2.COLOR_BGR2RGB)
+    scale = 255.0 if pixels.dtype == np.uint8 else 1.0
+    image = torch.from_numpy(np.ascontiguousarray(pixels)).float().movedim(-1, 0) / scale
+    require(bool(torch.isfinite(image).all()), setting, f"{path} with NaN or infinite pixels", "finite values")
+    return image
+
+
+def read_disparity(path: Path, setting: str) -> Tensor:
+    """A disparity map (H, W) in pixels; not finite where unknown.
+
+    Args:
+        path: PFM, NPY, NPZ (its first array), or 16-bit PNG in 1/256 px with 0 for unknown (KITTI's).
+        setting: the name of the setting, for errors.
+
+    Raises:
+        SettingError: for a file that is missing or of another form.
+    """
+    import cv2
+
+    _exists(path, setting)
+    if path.suffix.lower() in (".npy", ".npz"):
+        values = _array(path, setting)
+    else:
+        loaded = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if loaded is None or loaded.ndim != 2 or loaded.dtype not in (np.float32, np.uint16):
+            raise SettingError(f"{setting} = {path}: expected a PFM, NPY, NPZ or 16-bit PNG disparity")
+        values = loaded if loaded.dtype == np.float32 else np.where(loaded == 0, np.nan, loaded / 256.0)
+    require(values.ndim == 2, setting, values.shape, "an array (H, W)")
+    return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
+
+
+def _array(path: Path, setting: str) -> np.ndarray:
+    try:
+        loaded = np.load(path, allow_pickle=False)
+        return np.asarray(loaded if isinstance(loaded, np.ndarray) else loaded[loaded.files[0]])
+    except (ValueError, IndexError, OSError) as error:
+        raise SettingError(f"{setting} = {path}: expected a NumPy file with an array of numbers") from error
+
+
+def write_ply(path: Path, mean: np.ndarray, cov: np.ndarray, colour: np.ndarray) -> None:
+    """Points as binary PLY, which every viewer opens; the covariance travels as extra properties.
+
+    Args:
+        path: the file.
+        mean: (N, 3) [m].
+        cov: (N, 6), xx xy xz yy yz zz [m²].
+        colour: (N, 3) in [0, 1].
+    """
+    names = [*"xyz", *(f"cov_{c}" for c in ("xx", "xy", "xz", "yy", "yz", "zz"))]
+    record = np.dtype([(name, "<f4") for name in names] + [(name, "u1") for name in ("red", "green", "blue")])
+    vertices = np.empty(len(mean), record)
+    for name, column in zip(names, np.concatenate([mean, cov], -1).T, strict=True):
+        vertices[name] = column
+    for name, column in zip(("red", "green", "blue"), colour.T, strict=True):
+        vertices[name] = (column.clip(0, 1) * 255).round()
+    kinds = {"<f4": "float", "|u1": "uchar"}
+    properties = "".join(f"property {kinds[record[name].str]} {name}\n" for name in record.names or ())
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(mean)}\n{properties}end_header\n"
+    with replacing(path) as temporary:
+        temporary.write_bytes(header.encode() + vertices.tobytes())
