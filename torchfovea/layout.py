@@ -33,7 +33,7 @@ class LogPolar:
     With `uniform_fovea` the numbers are those of the authors' programs, S = 2√(πN)/√(1 + 2 ln C), R = (S/2π) ln C with
     C = ρ_max/ρ_min, and the N − R·S RFs left over are a fovea. The programs store it as a square image of side
     √(N − R·S); our reading is that as many RFs of a square lattice fill the disc inside ρ_min: those nearest to the
-    axis, at a pitch of ρ_min √(π/n), which is the first ring's width but for rounding.
+    axis, at a pitch of about ρ_min √(π/n), which is the first ring's width but for rounding.
 
     RFs are ordered by ring, then sector (ring-major, θ from +x towards +y); a uniform fovea comes first.
 
@@ -109,7 +109,7 @@ class LogPolar:
     @property
     def fovea_pitch_px(self) -> float:
         """Spacing of the uniform fovea's lattice [px]; 0 without one."""
-        return self.rho_min_px * math.sqrt(math.pi / self.fovea_count) if self.fovea_count else 0.0
+        return self.rho_min_px / _fovea_lattice(self.fovea_count)[0] if self.fovea_count else 0.0
 
     def centers_px(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Tensor:
         """Centres of the RFs, (N, 2) [px]. Built once; do not write into it."""
@@ -124,11 +124,11 @@ class LogPolar:
         slope = (self.base - 1) / math.sqrt(self.base)
         smallest = self.fovea_pitch_px or self.rho_min_px * (self.base - 1)
         # the floor is under the root: its gradient at the axis is 0, not NaN
-        return slope * px.square().sum(-1).clamp(min=(smallest / slope) ** 2).sqrt()
+        return slope * _square(px).clamp(min=(smallest / slope) ** 2).sqrt()
 
     def inside(self, px: Tensor) -> Tensor:
         """Whether places (..., 2) [px] lie on the retina; bool (...)."""
-        return px.square().sum(-1) <= self.radius_px**2
+        return _square(px) <= self.radius_px**2
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ class Uniform:
 
     def inside(self, px: Tensor) -> Tensor:
         """Whether places (..., 2) [px] lie on the retina; bool (...)."""
-        return px.square().sum(-1) <= self.radius_px**2
+        return _square(px) <= self.radius_px**2
 
 
 Retina = LogPolar | Uniform
@@ -203,6 +203,12 @@ def cortical(values: Tensor, retina: LogPolar) -> Tensor:
     require(isinstance(retina, LogPolar), "retina", type(retina).__name__, "a LogPolar retina")
     require(values.shape[-1] == retina.count, "values.shape", tuple(values.shape), f"(..., {retina.count})")
     return values[..., retina.fovea_count :].unflatten(-1, retina.shape)
+
+
+def _square(px: Tensor) -> Tensor:
+    """Squared length (...) of (..., 2); written out, for sums over so short an axis are slow."""
+    x, y = px.unbind(-1)
+    return x * x + y * y
 
 
 def _require_disc(receptive_fields: int, radius_px: float) -> None:
@@ -259,13 +265,15 @@ def _disc_lattice(budget: int) -> tuple[float, tuple[float, float], np.ndarray]:
     raise AssertionError("the last axis has no symmetry, so that every count occurs")
 
 
-def _fovea_lattice(retina: LogPolar) -> np.ndarray:
-    """Centres (n, 2) [px] of the uniform fovea: the n lattice points nearest to the axis, by row and column."""
-    reach = math.ceil(math.sqrt(retina.fovea_count / math.pi)) + 2
+@lru_cache(maxsize=64)
+def _fovea_lattice(count: int) -> tuple[float, np.ndarray]:
+    """The lattice points nearest to the axis: the radius of their disc [pitches], and x, y (n, 2) by row and column."""
+    ideal = math.sqrt(count / math.pi)
+    reach = math.ceil(ideal) + 2
     side = np.arange(-reach, reach) + 0.5
     y, x = (axis.ravel() for axis in np.meshgrid(side, side, indexing="ij"))
-    nearest = np.sort(np.argsort(np.round(x * x + y * y, 6), kind="stable")[: retina.fovea_count])
-    return np.stack([x[nearest], y[nearest]], -1) * retina.fovea_pitch_px
+    nearest = np.sort(np.argsort(np.round(x * x + y * y, 6), kind="stable")[:count])
+    return max(ideal, 1.000001 * np.hypot(x, y)[nearest].max()), np.stack([x[nearest], y[nearest]], -1)
 
 
 @lru_cache(maxsize=64)
@@ -280,6 +288,6 @@ def _centers(retina: Retina, device: torch.device, dtype: torch.dtype) -> Tensor
             theta = 2 * math.pi * (np.arange(retina.sectors) + 0.5) / retina.sectors
             px = np.stack([rho * np.cos(theta), rho * np.sin(theta)], -1).reshape(-1, 2)
             if retina.fovea_count:
-                px = np.concatenate([_fovea_lattice(retina), px])
+                px = np.concatenate([_fovea_lattice(retina.fovea_count)[1] * retina.fovea_pitch_px, px])
         # coordinates outermost in memory: both components of (N, 2) are contiguous
         return torch.as_tensor(np.ascontiguousarray(px.T)).to(device, dtype).mT

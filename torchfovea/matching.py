@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchfovea.camera import Camera, Pinhole
 from torchfovea.correspondence import Budget, Correspondences, Disparity, eye_sigma_px
+from torchfovea.gaussian import columns
 from torchfovea.retina import Retina, fovea, interpolate
 from torchfovea.rig import StereoRig, posed, verged
 from torchfovea.setting import require
@@ -85,9 +86,9 @@ def match_sgbm(
     width, height = (((high - low) * focal).ceil().int() + 1).clamp(min=1).tolist()
     before, after = max(search[1], 0), max(-search[0], 0)
     view = Pinhole(focal, before - low[0].item() * focal, -low[1].item() * focal)
-    x = torch.arange(before + width + after, device=pair.device, dtype=pair.dtype)
-    y = torch.arange(height, device=pair.device, dtype=pair.dtype)
-    rays = view.rays(torch.stack(torch.broadcast_tensors(x, y[:, None]), -1))
+    column = torch.arange(before + width + after, device=pair.device, dtype=pair.dtype)
+    row = torch.arange(height, device=pair.device, dtype=pair.dtype)
+    rays = view.rays(columns(*torch.broadcast_tensors(column, row[:, None])))
     seen = [camera.project(rays @ R) for R in (R_left, R_right)]
     views = [interpolate(values[i : i + 1], retina, px)[0, 0] for i, px in enumerate(seen)]
     disparity = dense_disparity(views, search, params, view, 0.0, rig.baseline_m, pad=False)
@@ -95,12 +96,16 @@ def match_sgbm(
     left_px = retina.centers_px(pair.device, pair.dtype)
     directions = camera.rays(left_px) @ R_left.mT
     place = view.project(directions)
-    inside = view.in_view(directions) & (directions[..., :2].abs() <= limit * directions[..., 2:]).all(-1)
+    x, y, z = directions.unbind(-1)
+    inside = view.in_view(directions) & (x.abs() <= limit * z) & (y.abs() <= limit * z)
     shift, found = read_disparity(disparity, place, params.edge_px)
     found &= inside & in_range(shift, focal * rig.baseline_m, nearest_range_m, farthest_range_m)
-    there = view.rays(place - torch.stack([shift, torch.zeros_like(shift)], -1)) @ R_right
+    there = view.rays(columns(place[..., 0] - shift, place[..., 1])) @ R_right
     right_px = camera.project(there)
     found &= camera.in_view(there) & retina.inside(right_px)
+    # for pictures: nothing where the left eye does not look
+    looks = retina.inside(seen[0]) & camera.in_view(rays @ R_left)
+    disparity = disparity._replace(image=disparity.image * looks, valid=disparity.valid & looks)
     return correspondences(left_px, right_px, found, retina, budget), disparity
 
 
@@ -126,6 +131,7 @@ def grey_pair(left: Tensor | np.ndarray, right: Tensor | np.ndarray) -> Tensor:
 
 
 def check_range(nearest_range_m: float, farthest_range_m: float) -> None:
+    """Raise SettingError for an impossible range of depths."""
     require(0 < nearest_range_m < math.inf, "nearest_range_m", nearest_range_m, "a positive distance in metres")
     require(farthest_range_m > nearest_range_m, "farthest_range_m", farthest_range_m, f"more than {nearest_range_m}")
 
@@ -171,21 +177,22 @@ def read_disparity(disparity: Disparity, place: Tensor, edge_px: float) -> tuple
     must be valid itself: nothing is averaged over a depth edge.
     """
     height, width = disparity.disparity.shape
-    near = place.round()
-    on = ((near >= 0) & (near <= near.new_tensor([width - 1, height - 1]))).all(-1)
-    column, row = torch.where(on[:, None], near, torch.zeros_like(near)).long().unbind(-1)
-    reference, found = disparity.disparity[row, column], on & disparity.valid[row, column]
-    corner = place.floor()
-    total, weighted = torch.zeros_like(reference), torch.zeros_like(reference)
+    x, y = place.unbind(-1)
+    column, row = x.round(), y.round()
+    on = (column >= 0) & (column <= width - 1) & (row >= 0) & (row <= height - 1)
+    zero = torch.zeros_like(x)
+    nearest = torch.where(on, row, zero).long() * width + torch.where(on, column, zero).long()
+    values, valid = disparity.disparity.flatten(), disparity.valid.flatten()
+    reference, found = values[nearest], on & valid[nearest]
+    left, top = x.floor(), y.floor()
+    total, weighted = zero, zero
     for dx in (0, 1):
         for dy in (0, 1):
-            at = corner + corner.new_tensor([dx, dy])
-            u = at[:, 0].clamp(0, width - 1).long()
-            v = at[:, 1].clamp(0, height - 1).long()
-            here = disparity.disparity[v, u]
-            weight = (1 - (place - at).abs()).clamp(min=0).prod(-1)
-            weight = weight * (disparity.valid[v, u] & ((here - reference).abs() <= edge_px))
-            total, weighted = total + weight, weighted + weight * here
+            u, v = left + dx, top + dy
+            at = v.clamp(0, height - 1).long() * width + u.clamp(0, width - 1).long()
+            weight = (1 - (x - u).abs()).clamp(min=0) * (1 - (y - v).abs()).clamp(min=0)
+            weight = weight * (valid[at] & ((values[at] - reference).abs() <= edge_px))
+            total, weighted = total + weight, weighted + weight * values[at]
     found = found & (total > 0)
     value = weighted / torch.where(found, total, torch.ones_like(total))
     return torch.where(found, value, torch.zeros_like(value)), found
@@ -200,6 +207,7 @@ def in_range(shift: Tensor, reach: float, nearest_m: float, farthest_m: float) -
 def correspondences(
     left_px: Tensor, right_px: Tensor, valid: Tensor, retina: Retina | None, budget: Budget
 ) -> Correspondences:
+    """Places (N, 2) in both eyes with their σ from the budget; without a retina in image pixels."""
     right_px = torch.where(valid[:, None], right_px, left_px)
     if retina is None:  # the RFs are the source's pixels
         sigma = math.sqrt(budget.sigma_over_width**2 + budget.match_px**2)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchfovea.camera import Pinhole
 from torchfovea.correspondence import Budget, Correspondences, Disparity
+from torchfovea.gaussian import columns
 from torchfovea.matching import check_range, correspondences, dense_disparity, grey_pair, in_range, read_disparity
 from torchfovea.retina import Retina, fovea, interpolate
 from torchfovea.setting import require
@@ -82,7 +83,7 @@ def match_rectified(
         values = fovea(pair, pair.new_tensor([middle, middle]), retina, scale)  # (2, 1, N)
         x = (torch.arange(width, device=pair.device, dtype=pair.dtype) - middle[0]) / scale
         y = (torch.arange(height, device=pair.device, dtype=pair.dtype) - middle[1]) / scale
-        views = list(interpolate(values, retina, torch.stack(torch.broadcast_tensors(x, y[:, None]), -1))[:, 0])
+        views = list(interpolate(values, retina, columns(*torch.broadcast_tensors(x, y[:, None])))[:, 0])
     disparity = dense_disparity(views, search, params, camera_left, doffs, baseline_m, pad=True)
     found = match_disparity(
         disparity.disparity,
@@ -151,7 +152,7 @@ def match_disparity(
     (u0, v0), scale = _gaze(gaze_px, height, width, retina)
     if retina is None:
         x, y = (torch.arange(n, device=values.device, dtype=values.dtype) for n in (width, height))
-        left_px = torch.stack(torch.broadcast_tensors(x, y[:, None]), -1).reshape(-1, 2)
+        left_px = columns(*torch.broadcast_tensors(x, y[:, None])).reshape(-1, 2)
         u0, v0, scale = 0.0, 0.0, 1.0
     else:
         left_px = retina.centers_px(values.device, values.dtype)
@@ -160,7 +161,7 @@ def match_disparity(
     field = Disparity(torch.zeros_like(values), values, trusted, camera_left, doffs, baseline_m)
     shift, found = read_disparity(field, place, edge_px)
     found &= in_range(shift + doffs, camera_left.focal_px * baseline_m, nearest_range_m, farthest_range_m)
-    there = place - torch.stack([shift, torch.zeros_like(shift)], -1)
+    there = columns(place[:, 0] - shift, place[:, 1])
     found &= (there[:, 0] >= -0.5) & (there[:, 0] <= width - 0.5)
     right_px = (there - there.new_tensor([u0, v0])) / scale
     if retina is not None:

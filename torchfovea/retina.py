@@ -3,10 +3,9 @@
 An RF averages what it covers. Averages come from an image pyramid, as in mip-mapping: each level halves the one below
 with the binomial filter (1, 3, 3, 1)/8 along both axes, so that pixel k of level l has its centre at 2ˡk + (2ˡ − 1)/2
 in the image's pixels. An RF that is W image pixels wide is read, bilinearly, at level log₂W − 1, between the two
-nearest levels. What it then weighs spreads over 0.32 W (standard deviation along an axis); a W-wide square spreads over
-0.29 W.
+nearest levels. What it then weighs spreads over 0.32 W (standard deviation along an axis); a square, over 0.29 W.
 
-Pixel centres are integers; an image of `size` pixels along an axis has its middle at (size − 1)/2.
+Pixel centres are integers; an image's middle is at (size − 1)/2.
 """
 
 from __future__ import annotations
@@ -20,6 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchfovea.gaussian import columns
 from torchfovea.layout import LogPolar, Retina, Uniform, cortical
 from torchfovea.setting import require
 
@@ -72,16 +72,14 @@ def fovea(image: Tensor, gaze_px: Tensor | None, retina: Retina, scale: float | 
         grid = plan.middle
     else:
         _check_gaze(gaze_px)
-        require(
-            len(image) in (1, len(gaze_px)), "gaze_px.shape", tuple(gaze_px.shape), f"({len(image)}, 2), one per image"
-        )
+        fits = len(image) in (1, len(gaze_px))
+        require(fits, "gaze_px.shape", tuple(gaze_px.shape), f"({len(image)}, 2), one per image")
         grid = _place(plan, gaze_px.to(image))
     values = _read(image, grid[:, : plan.above])
     if plan.levels == 0:
         return values
     values = torch.cat([values, _read(_pyramid(image, plan.levels), grid[:, plan.above :])], -1)
-    count = retina.count
-    wide = torch.lerp(values[..., plan.first : count], values[..., count:], plan.blend)
+    wide = torch.lerp(values[..., plan.first : retina.count], values[..., retina.count :], plan.blend)
     return torch.cat([values[..., : plan.first], wide], -1)
 
 
@@ -138,7 +136,7 @@ def interpolate(values: Tensor, retina: Retina, px: Tensor) -> Tensor:
     else:
         out = _from_rings(values, retina, flat)
         if retina.fovea_count:
-            inside = flat.square().sum(-1) < retina.rho_min_px**2
+            inside = flat[:, 0] ** 2 + flat[:, 1] ** 2 < retina.rho_min_px**2
             out = torch.where(inside, _from_lattice(values[..., : retina.fovea_count], retina, flat), out)
     return out.reshape(*values.shape[:2], *px.shape[:-1])
 
@@ -166,7 +164,7 @@ def reconstruct(
     scale = _checked_scale((height, width), retina, scale)
     x = (torch.arange(width, device=values.device, dtype=values.dtype) - (width - 1) / 2) / scale
     y = (torch.arange(height, device=values.device, dtype=values.dtype) - (height - 1) / 2) / scale
-    px = torch.stack(torch.broadcast_tensors(x, y[:, None]), -1)
+    px = columns(*torch.broadcast_tensors(x, y[:, None]))
     mask = retina.inside(px)
     image = interpolate(values, retina, px)
     return torch.where(mask, image, torch.zeros_like(image)), mask
@@ -274,12 +272,13 @@ def _from_rings(values: Tensor, retina: LogPolar, px: Tensor) -> Tensor:
     image = torch.cat([image[..., :1, :].mean(-1, keepdim=True).expand(*image.shape[:2], 1, sectors), image], -2)
     image = torch.cat([image[..., -1:], image, image[..., :1]], -1)
     innermost = retina.rho_min_px * math.sqrt(retina.base)
-    rho = px.square().sum(-1).sqrt()
+    x, y = px.unbind(-1)
+    rho = (x * x + y * y).sqrt()
     ring = torch.log(rho.clamp(min=innermost) / innermost) / math.log(retina.base)
     # row 0 is ring 0's mean, at the centre; a uniform fovea stands in its place
     inward = torch.zeros_like(rho) if retina.fovea_count else (rho / innermost).clamp(max=1) - 1
     row = ring + inward + 1
-    angle = torch.atan2(px[..., 1], px[..., 0])
+    angle = torch.atan2(y, x)
     column = torch.remainder(angle * (sectors / (2 * math.pi)), sectors) + 0.5
     return _bilinear(image, column, row)
 
