@@ -168,7 +168,7 @@ def draw_sense(path: Path, left: Tensor, disparity: Disparity, observed: Observa
         low, high = (
             (float(q) for q in torch.quantile(value.double(), torch.tensor([0.02, 0.98], dtype=torch.float64)))
             if len(value)
-            else (0.0, 1.0)
+            else (0.1, 1.0)
         )
         drawn = place.scatter(
             *px[keep].T, c=value, s=1.5, cmap=cmap, linewidths=0, norm="log" if log else None, rasterized=True

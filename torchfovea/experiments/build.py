@@ -100,9 +100,10 @@ def whole(cfg: DictConfig, setting: str, least: int = 1) -> int:
 
 def number(cfg: DictConfig, setting: str) -> float:
     """A positive number, read at a dotted name."""
-    value = _typed(OmegaConf.select(cfg, setting), "float", setting)
-    require(value > 0, setting, value, "a positive number")
-    return float(value)
+    given = OmegaConf.select(cfg, setting)
+    value = float(_typed(given, "float", setting))
+    require(value > 0, setting, given, "a positive number")
+    return value
 
 
 def build_sensor(cfg: DictConfig) -> tuple[Camera, Retina]:
@@ -208,7 +209,8 @@ def build_arena(cfg: DictConfig, observer: Observer, seed: int) -> Arena:
         source_px=whole(cfg, "sensor.source_px", 16),
         radius_px=observer.retina.radius_px,
     )
-    return Arena(world, observer, None if fidelity == "geometric" else build_matcher(cfg))
+    matcher = build_matcher(cfg)  # checked even where it is not used
+    return Arena(world, observer, None if fidelity == "geometric" else matcher)
 
 
 def build_matcher(cfg: DictConfig) -> tuple[SGBM, float]:

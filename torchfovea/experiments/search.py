@@ -46,7 +46,8 @@ def run(cfg: DictConfig) -> float:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*bars, console=Console(stderr=True), transient=True) as progress:
+    console = Console(stderr=True)
+    with Progress(*bars, console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("search", total=episodes * saccades)
         for k in range(episodes):
             generator = torch.Generator().manual_seed(seed + k)

@@ -1,0 +1,113 @@
+"""`torchfovea search` as a user runs it: its files, its figures, its errors."""
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from torchfovea.cli import main
+
+SMALL = ["episodes=1", "saccades=3", "sensor.receptive_fields=2000", "memory.cells=1500", "sensor.source_px=200"]
+RESULT = {
+    "gap_final",
+    "gap_per_saccade",
+    "regret_per_saccade",
+    "global_information_per_saccade",
+    "local_information_per_saccade",
+    "saccades_to_target",
+    "found",
+    "target_error_m",
+    "degrees_travelled",
+    "seconds_per_saccade",
+    "episodes",
+}
+SACCADES = (
+    "episode,saccade,pan_rad,tilt_rad,vergence_rad,range_m,reward,gap,regret,global_information,local_information"
+)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """An empty working folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    return tmp_path
+
+
+def search(capsys, *overrides):
+    assert main(["search", *SMALL, *overrides]) == 0, capsys.readouterr().err
+    run = Path(capsys.readouterr().out.splitlines()[-1])
+    return run, json.loads((run / "result.json").read_text())
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["fidelity=geometric", "episodes=2", "sensor=uniform"],
+        ["fidelity=photometric"],
+        ["fidelity=geometric", "motor=physics", "scene=cans", "scene.outside_first_view=true", "sensor.fov_deg=90"],
+        ["fidelity=geometric", "reading=printed"],
+        ["fidelity=geometric", "sensor.camera=fisheye", "sensor.fov_deg=150", "acquisition=ei", "memory=geodesic"],
+    ],
+    ids=["uniform", "photometric", "physics", "printed", "fisheye"],
+)
+def test_files_and_figures(folder, capsys, overrides):
+    run, result = search(capsys, *overrides)
+    assert result.keys() >= RESULT
+    assert {"episode.png", "episodes.csv", "saccades.csv", "result.json"} <= {p.name for p in run.iterdir()}
+    rows = list(csv.reader((run / "saccades.csv").read_text().splitlines()))
+    assert ",".join(rows[0]) == SACCADES
+    assert len(rows) == 1 + 3 * result["episodes"]
+    assert [float(v) for v in rows[1][2:5]] == [0, 0, 0]  # t = 1 is the initial gaze
+    gaps = [float(row[7]) for row in rows[1:]]
+    assert all(0 <= g <= 1 for g in gaps)
+    assert result["gap_per_saccade"] == pytest.approx(sum(gaps) / len(gaps), abs=1e-6)
+    assert (run / "episode.png").stat().st_size > 10_000
+
+
+def test_same_seed_same_run_and_explicit_settings_beat_the_profile(folder, capsys):
+    overrides = ["fidelity=geometric", "profile=quick"]
+    first, _ = search(capsys, *overrides)
+    again, result = search(capsys, *overrides)
+    other, _ = search(capsys, *overrides, "seed=1")
+    assert (first / "saccades.csv").read_text() == (again / "saccades.csv").read_text()
+    assert (first / "saccades.csv").read_text() != (other / "saccades.csv").read_text()
+    assert result["episodes"] == 1  # the profile says more
+
+
+@pytest.mark.parametrize(
+    ("overrides", "line"),
+    [
+        (["scene=foo"], "scene = foo: expected one of attention_world, cans"),
+        (["sensor=foo"], "sensor = foo: expected one of"),
+        (["acquisition=foo"], "acquisition = foo: expected one of"),
+        (["memory=foo"], "memory = foo: expected one of"),
+        (["acquisition.alpha=-1"], "acquisition.alpha = -1"),
+        (["acquisition.alpha=abc"], "acquisition.alpha = abc: expected a number"),
+        (["memory.cells=0"], "memory.cells = 0: expected at least 1"),
+        (["memory.cells=1.5"], "memory.cells = 1.5: expected a whole number"),
+        (["sensor.fov_deg=180"], "sensor.fov_deg = 180"),
+        (["sensor.receptive_fields=3"], "sensor.receptive_fields = 3"),
+        (["saccades=0"], "saccades = 0"),
+        (["episodes=-2"], "episodes = -2"),
+        (["fidelity=perfect"], "fidelity = perfect: expected one of photometric, geometric"),
+        (["motor=magic"], "motor = magic: expected one of instant, physics"),
+        (["head.baseline_m=0"], "head.baseline_m = 0"),
+        (["prior.std=0"], "prior.std = 0"),
+        (["fusion.name=mean"], "fusion = mean"),
+        (["matcher.block_px=4"], "matcher.block_px = 4"),
+        (["far_m=0.1"], "far_m = 0.1"),
+        (["memory.weights=[0]"], "weights = "),
+        (["memory.means=[[-1,0,0]]", "memory.covariances=[[1e-4,1e-4,1e-4]]"], "reachable = "),
+        (["scene=cans", "scene.cans=1"], "scene.cans = 1"),
+        (["sensor.nothing=1"], "sensor.nothing = 1: expected a known setting"),
+        (["seed=-1"], "seed = -1"),
+    ],
+)
+def test_a_mistake_is_one_line_and_leaves_nothing(folder, capsys, overrides, line):
+    assert main(["search", *SMALL, "fidelity=geometric", *overrides]) != 0
+    printed = capsys.readouterr()
+    assert printed.err.startswith("torchfovea search: ") and len(printed.err.splitlines()) == 1, printed.err
+    assert line in printed.err
+    assert not list(folder.rglob("result.json")) and not list(folder.rglob("*.csv"))
