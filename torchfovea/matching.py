@@ -158,8 +158,8 @@ def dense_disparity(
     pad: bool,
 ) -> Disparity:
     """Match two rectified views (H, W)."""
-    bytes_ = [(view.clamp(0, 1) * 255).round().byte().cpu().numpy() for view in views]
-    disparity, valid = disparity_sgbm(bytes_[0], bytes_[1], search, params, pad)
+    left, right = (view.float().cpu().numpy() for view in views)
+    disparity, valid = disparity_sgbm(left, right, search, params, pad)
     return Disparity(
         views[0],
         torch.as_tensor(disparity).to(views[0]),

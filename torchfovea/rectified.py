@@ -161,9 +161,9 @@ def match_disparity(
     field = Disparity(torch.zeros_like(values), values, trusted, camera_left, doffs, baseline_m)
     shift, found = read_disparity(field, place, edge_px)
     found &= in_range(shift + doffs, camera_left.focal_px * baseline_m, nearest_range_m, farthest_range_m)
-    there = columns(place[:, 0] - shift, place[:, 1])
-    found &= (there[:, 0] >= -0.5) & (there[:, 0] <= width - 0.5)
-    right_px = (there - there.new_tensor([u0, v0])) / scale
+    right_x = place[:, 0] - shift
+    found &= (right_x >= -0.5) & (right_x <= width - 0.5)
+    right_px = columns(left_px[:, 0] - shift / scale, left_px[:, 1])
     if retina is not None:
         found &= retina.inside(right_px)
     cameras = [

@@ -113,8 +113,8 @@ def disparity_sgbm(
     """Disparity of every pixel of the left image.
 
     Args:
-        left: (H, W) uint8.
-        right: (H, W) uint8, in rectified pixels: what is at column x on the left is at x − d on the right.
+        left: (H, W) float32, grey, 0 to 1.
+        right: (H, W) float32; what is at column x on the left is at x − d on the right.
         search: the first disparity searched and one past the last (`SGBM.search`).
         params: the matcher's parameters.
         pad: extend both images so that every left pixel can be searched. Without it the first `search[1]` columns and
@@ -128,6 +128,11 @@ def disparity_sgbm(
     """
     cv2 = _opencv()
     first, end = search
+    # from the unrounded image: where it is flat between two grey levels, rounding draws a texture of its own
+    gradient = np.abs(cv2.Sobel(left, cv2.CV_32F, 1, 0, ksize=3)) * (255 / 8)
+    window = params.block_px + 4
+    textured = cv2.blur(gradient, (window, window)) > params.texture
+    left, right = (np.rint(image.clip(0, 1) * 255).astype(np.uint8) for image in (left, right))
     before, after = (max(end, 0), max(-first, 0)) if pad else (0, 0)
     width = left.shape[1]
     if pad:
@@ -151,13 +156,9 @@ def disparity_sgbm(
         mode=modes[params.mode],
     )
     raw = matcher.compute(np.ascontiguousarray(left), np.ascontiguousarray(right))
-    valid = raw >= 16 * first
-    # equal costs pass the matcher's uniqueness test: without texture it reports its first disparity
-    gradient = np.abs(cv2.Sobel(left, cv2.CV_32F, 1, 0, ksize=3)) / 8
-    window = params.block_px + 4
-    valid &= cv2.blur(gradient, (window, window)) > params.texture
     inner = slice(before, before + width)
-    valid = valid[:, inner]
+    # equal costs pass the matcher's uniqueness test: without texture it reports its first disparity
+    valid = (raw[:, inner] >= 16 * first) & textured
     return np.where(valid, raw[:, inner] / np.float32(16), np.float32(0)), valid
 
 
