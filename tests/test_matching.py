@@ -1,4 +1,4 @@
-"""Matching against synthetic pairs whose correspondences are known: planes with an analytic texture, ray-traced here."""
+"""Matching against synthetic pairs whose correspondences are known: textured planes, ray-traced in this file."""
 
 import math
 import sys
