@@ -1,4 +1,4 @@
-"""The renderer ``gl``: pictures by OpenGL through MuJoCo, with the textures of the ray renderer baked onto the solids."""
+"""The renderer ``gl``: pictures by OpenGL through MuJoCo, the ray renderer's textures baked onto the solids."""
 
 from __future__ import annotations
 
@@ -72,41 +72,36 @@ def _texture(scene: Scene, geom: int, solid: Solid) -> np.ndarray:
     """The cube map (6 W, W, 3) uint8 of a solid: the colours that the ray renderer gives its surface."""
     side = _TEXELS[solid.kind]
     sheet = np.full((6, side, side, 3), 128, np.uint8)
-    size = torch.tensor(_half_size(solid), dtype=torch.float32)
-    centre = torch.tensor(solid.position_m, dtype=torch.float32)
+    size = np.array(_half_size(solid))
     c, s = math.cos(solid.yaw_rad), math.sin(solid.yaw_rad)
-    turn = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    texel = (torch.arange(side) + 0.5) / side * 2 - 1
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    texel = (np.arange(side) + 0.5) / side * 2 - 1
     for face, (axis, sign, across, across_sign, down, down_sign) in enumerate(_FACES):
         if solid.kind in (FLOOR, ROOM) and not _faces_room(solid, axis, sign):
             continue
-        place = torch.zeros(side, side, 3)
+        place = np.empty((side, side, 3))
         place[..., axis] = sign
         place[..., across] = across_sign * texel[None, :]
         place[..., down] = down_sign * texel[:, None]
-        normal = torch.zeros_like(place)
+        normal = np.zeros_like(place)
         normal[..., axis] = sign
         if solid.shape == "sphere":
-            place = torch.nn.functional.normalize(place, dim=-1)
+            place /= np.linalg.norm(place, axis=-1, keepdims=True)
             normal = place
         elif solid.shape == "cylinder":
-            radial = place[..., :2].norm(dim=-1)
-            round_ = radial >= place[..., 2].abs()
-            place = place / torch.maximum(radial, place[..., 2].abs())[..., None]
-            normal = torch.where(round_[..., None], place * torch.tensor([1.0, 1.0, 0.0]), normal)
-            if axis != 2:  # the corners of a side face still belong to the lids
-                lid = torch.zeros_like(place)
-                lid[..., 2] = place[..., 2].sign()
-                normal = torch.where(round_[..., None], normal, lid)
-        points = (place * size).reshape(-1, 3) @ turn.T + centre
-        normals = normal.reshape(-1, 3) @ turn.T
-        width = torch.tensor(2 * float(torch.maximum(size[across], size[down])) / side)
-        parts = []
-        for part, facing in zip(points.split(_BAKED), normals.split(_BAKED), strict=True):
-            index = torch.full((len(part),), geom)
-            parts.append(colour(scene.paint, index, part, facing, width.expand(len(part))))
-        rgb = torch.cat(parts)
-        sheet[face] = (rgb.reshape(side, side, 3) * 255).round().byte().numpy()
+            # a cube map is looked up by direction: where that leaves the cylinder may be its side or a lid
+            radial, upright = np.hypot(place[..., 0], place[..., 1]), np.abs(place[..., 2])
+            place /= np.maximum(radial, upright)[..., None]
+            curved = (radial >= upright)[..., None]
+            normal = np.where(curved, place * [1.0, 1.0, 0.0], np.sign(place) * [0.0, 0.0, 1.0])
+        points = ((place * size) @ turn.T + solid.position_m).reshape(-1, 3).astype(np.float32)
+        facing = (normal @ turn.T).reshape(-1, 3).astype(np.float32)
+        width = np.float32(2 * max(size[across], size[down]) / side)
+        for start in range(0, side * side, _BAKED):
+            rows = slice(start, start + _BAKED)
+            n = len(points[rows])
+            rgb = colour(scene.paint, np.full(n, geom), points[rows], facing[rows], np.full(n, width))
+            sheet[face].reshape(-1, 3)[rows] = np.round(rgb * 255)
     return sheet.reshape(6 * side, side, 3)
 
 

@@ -39,8 +39,8 @@ class InstantMotor:
     """Jumps exactly to the commanded gaze; its duration is a model.
 
     Eyes follow the main sequence, duration = 21 ms + 2.2 ms/deg of rotation (Carpenter, Movements of the Eyes, 1988;
-    for the half vergence each eye turns by); the neck's pan and tilt accelerate and brake at a constant rate up to a top
-    speed, as a robot's do. All joints start together: the slowest counts. Nothing moved takes no time.
+    for the half vergence each eye turns by); the neck's pan and tilt accelerate and brake at a constant rate up to
+    a top speed, as a robot's do. All joints start together: the slowest counts. Nothing moved takes no time.
 
     Attributes:
         eye_base_s: of the main sequence.

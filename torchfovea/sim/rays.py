@@ -23,9 +23,10 @@ MISS_RANGE_M = 1000.0
 """The range that a ray gets which meets nothing; its geom is -1."""
 
 _PARALLEL_FROM = 4000  # rays below which a second thread costs more than it saves
-_STEEPEST = 0.12  # cosine of the slant at which the footprint stops growing
+_SKY = (0.62, 0.72, 0.82)
+_STEEPEST = np.float32(0.12)  # cosine of the slant at which the footprint stops growing
 _CUTOFF_M = 1e6  # surfaces beyond are misses
-_CHUNK = 8192  # pixels shaded at once: they stay in the cache, and torch starts no threads of its own for them
+_CHUNK = 8192  # pixels shaded at once: they stay in the cache
 
 
 class RayHits(NamedTuple):
@@ -127,6 +128,7 @@ def cast(scene: Scene, origin_e: Tensor, directions_e: Tensor) -> RayHits:
     """
     require(directions_e.dim() == 2 and directions_e.shape[1] == 3, "directions_e", tuple(directions_e.shape), "(N, 3)")
     require(origin_e.shape == (3,), "origin_e", tuple(origin_e.shape), "(3,)")
+    require(bool(torch.isfinite(origin_e).all()), "origin_e", origin_e.tolist(), "a finite point")
     d = directions_e.detach().to("cpu", torch.float64).numpy()
     if len(d) == 0:
         return RayHits(directions_e[:, 0], torch.empty(0, dtype=torch.long), directions_e)
@@ -134,7 +136,6 @@ def cast(scene: Scene, origin_e: Tensor, directions_e: Tensor) -> RayHits:
     require(bool(np.isfinite(length).all() and (length > 0).all()), "directions_e", "zero or not finite", "directions")
     rotation, translation = scene.world_from_ego
     origin = rotation @ origin_e.detach().to("cpu", torch.float64).numpy() + translation
-    require(bool(np.isfinite(origin).all()), "origin_e", origin_e.tolist(), "a finite point")
     distance, geom, normal = _cast_world(scene, origin, (d / length[:, None]) @ rotation.T)
     dtype = directions_e.dtype
     return RayHits(
@@ -145,7 +146,7 @@ def cast(scene: Scene, origin_e: Tensor, directions_e: Tensor) -> RayHits:
 
 
 @lru_cache(maxsize=8)
-def _pixel_rays(camera: Camera, size_px: int) -> tuple[np.ndarray, Tensor]:
+def _pixel_rays(camera: Camera, size_px: int) -> tuple[np.ndarray, np.ndarray]:
     """Unit rays (H·W, 3) and the angle that each pixel spans (H·W,) [rad]."""
     index = torch.arange(size_px, dtype=torch.float64)
     v, u = torch.meshgrid(index, index, indexing="ij")
@@ -156,7 +157,7 @@ def _pixel_rays(camera: Camera, size_px: int) -> tuple[np.ndarray, Tensor]:
         shift = torch.tensor(step, dtype=torch.float64)
         ends = [torch.nn.functional.normalize(camera.rays(px + s * shift), dim=-1) for s in (-1, 1)]
         spans.append((ends[1] - ends[0]).norm(dim=-1))
-    return ray.reshape(-1, 3).numpy(), torch.maximum(*spans).reshape(-1).float()
+    return ray.reshape(-1, 3).numpy(), torch.maximum(*spans).reshape(-1).float().numpy()
 
 
 def render(scene: Scene, R: Tensor, t: Tensor, camera: Camera, size_px: int) -> Frame:
@@ -180,38 +181,43 @@ def render(scene: Scene, R: Tensor, t: Tensor, camera: Camera, size_px: int) -> 
     turn = rotation @ R.detach().to("cpu", torch.float64).numpy()
     origin = rotation @ t.detach().to("cpu", torch.float64).numpy() + translation
     n = len(ray)
-    image = torch.empty(3, n)
-    distance = torch.empty(n)
-    geom = torch.empty(n, dtype=torch.long)
-    normal = torch.empty(n, 3)
-    to_ego = torch.from_numpy(rotation).float()
+    image = np.empty((3, n), np.float32)
+    distance = np.empty(n, np.float32)
+    geom = np.empty(n, np.int64)
+    normal = np.empty((n, 3), np.float32)
+    from_world, centre = rotation.astype(np.float32), origin.astype(np.float32)
 
     def work(worker: int) -> None:
         for start in range(worker * _CHUNK, n, 2 * _CHUNK):
             rows = slice(start, min(start + _CHUNK, n))
             direction = ray[rows] @ turn.T
-            far, index, across = (torch.from_numpy(a) for a in _cast_part(scene, worker, origin, direction))
-            distance[rows], geom[rows] = far, index
-            across = across.float()
-            normal[rows] = across @ to_ego
-            image[:, rows] = _shade(
-                scene, torch.from_numpy(origin).float(), torch.from_numpy(direction).float(), distance[rows], geom[rows],
-                across, span[rows],
-            ).T  # fmt: skip
+            distance[rows], geom[rows], across64 = _cast_part(scene, worker, origin, direction)
+            across, way = across64.astype(np.float32), direction.astype(np.float32)
+            normal[rows] = across @ from_world
+            image[:, rows] = _shade(scene, centre, way, distance[rows], geom[rows], across, span[rows]).T
 
     _in_parallel(n, work)
     side = (size_px, size_px)
-    return Frame(image.reshape(3, *side), distance.reshape(side), geom.reshape(side), normal.reshape(*side, 3))
+    return Frame(
+        torch.from_numpy(image).reshape(3, *side),
+        torch.from_numpy(distance).reshape(side),
+        torch.from_numpy(geom).reshape(side),
+        torch.from_numpy(normal).reshape(*side, 3),
+    )
 
 
 def _shade(
-    scene: Scene, origin: Tensor, direction: Tensor, distance: Tensor, geom: Tensor, normal: Tensor, span: Tensor
-) -> Tensor:
+    scene: Scene,
+    origin: np.ndarray,
+    direction: np.ndarray,
+    distance: np.ndarray,
+    geom: np.ndarray,
+    normal: np.ndarray,
+    span: np.ndarray,
+) -> np.ndarray:
     """Colours (N, 3) of hits in the world; a miss is sky."""
     point = origin + distance[:, None] * direction
-    slant = (direction * normal).sum(-1).abs().clamp(min=_STEEPEST)
-    rgb = colour(scene.paint, geom.clamp(min=0), point, normal, distance * span / slant)
-    missed = geom < 0
-    if bool(missed.any()):
-        rgb[missed] = torch.tensor([0.62, 0.72, 0.82])
+    slant = np.maximum(np.abs(np.einsum("ni,ni->n", direction, normal)), _STEEPEST)
+    rgb = colour(scene.paint, np.maximum(geom, 0), point, normal, distance * span / slant)
+    rgb[geom < 0] = _SKY
     return rgb

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import torch
 
 from torchfovea.head import Head
 from torchfovea.setting import require
@@ -25,8 +24,8 @@ __all__ = [
     "TARGET",
     "Room",
     "Solid",
-    "can",
     "build_spec",
+    "can",
     "furnish",
     "paint_solids",
     "pole",
@@ -51,6 +50,7 @@ _FURNITURE = (
     ((0.42, 0.56, 0.34), (0.60, 0.64, 0.40)),
     ((0.62, 0.40, 0.48), (0.74, 0.58, 0.54)),
 )
+_FURNISHED = {"front_m": 3.0, "back_m": 1.8, "side_m": 2.4, "height_m": 2.2}  # the least that leaves the robot room
 _METAL = (0.40, 0.41, 0.44)
 
 
@@ -92,7 +92,8 @@ class Room:
         """Raise SettingError for a room without room."""
         for name in ("front_m", "back_m", "side_m", "height_m"):
             value = getattr(self, name)
-            require(1.0 <= value <= 50.0, f"room.{name}", value, "between 1 and 50 metres")
+            least = _FURNISHED[name] if self.furniture else 1.0
+            require(least <= value <= 50.0, f"room.{name}", value, f"{least} to 50 metres")
 
 
 def can(
@@ -139,9 +140,9 @@ def furnish(room: Room, rng: np.random.Generator) -> list[Solid]:
             ("cylinder", (-b + 0.7, -0.5 * s), (0.40, 0.60), 0.0),
         ]
         order = rng.permutation(len(pieces)) % len(_FURNITURE)
-        for i, ((shape, (x, y), size, yaw), k) in enumerate(zip(pieces, order, strict=True)):
-            place = (x, y, size[-1])
-            solids.append(Solid(f"furniture_{i}", FURNITURE, shape, place, size, yaw, *_FURNITURE[k]))
+        for i, ((shape, (x, y), extent, yaw), k) in enumerate(zip(pieces, order, strict=True)):
+            place = (x, y, extent[-1])
+            solids.append(Solid(f"furniture_{i}", FURNITURE, shape, place, extent, yaw, *_FURNITURE[k]))
     return solids
 
 
@@ -186,12 +187,12 @@ def build_spec(solids: Sequence[Solid], head: Head) -> Any:
 def paint_solids(solids: Sequence[Solid], rng: np.random.Generator) -> Paint:
     """What the solids look like; the generator draws each one's place in the noise."""
 
-    def tensor(values: Any) -> torch.Tensor:
-        return torch.as_tensor(np.asarray(values), dtype=torch.float32)
+    def rows(values: Iterable[Sequence[float]]) -> np.ndarray:
+        return np.array(list(values), np.float32)
 
     return Paint(
-        look=tensor([(*s.base, *s.accent, s.contrast) for s in solids]),
-        offset=tensor(rng.uniform(0, 20, (len(solids), 3))),
-        centre=tensor([s.position_m for s in solids]),
-        can=tensor([s.size_m if s.label else (0.0, 0.0) for s in solids]),
+        look=rows((*s.base, *s.accent, s.contrast) for s in solids),
+        offset=rng.uniform(0, 20, (len(solids), 3)).astype(np.float32),
+        centre=rows(s.position_m for s in solids),
+        can=rows(s.size_m[:2] if s.label else (0.0, 0.0) for s in solids),
     )

@@ -13,7 +13,7 @@ from torchfovea.setting import require
 from torchfovea.sim.backend import load_mujoco
 from torchfovea.sim.cans import Cans, place_cans, target_in_sight
 from torchfovea.sim.model import EgoPose, Nearest, Scene
-from torchfovea.sim.room import Room, Solid, can, build_spec, furnish, paint_solids
+from torchfovea.sim.room import Room, Solid, build_spec, can, furnish, paint_solids
 from torchfovea.sim.truth import find_nearest
 
 __all__ = ["AttentionWorld", "Cans", "EgoPose", "Nearest", "Room", "Scene", "build_scene", "stand_at"]
@@ -40,6 +40,8 @@ class AttentionWorld:
         """Raise SettingError for cans that overlap or reach the head."""
         require(0.01 <= self.can_radius_m <= 0.14, "scene.can_radius_m", self.can_radius_m, "0.01 to 0.14 m")
         require(0.02 <= self.can_height_m <= 0.5, "scene.can_height_m", self.can_height_m, "0.02 to 0.5 m")
+        require(self.room.front_m >= 2.5, "room.front_m", self.room.front_m, "at least 2.5 m behind the farthest can")
+        require(self.room.side_m >= 1.0, "room.side_m", self.room.side_m, "at least 1 m")
 
 
 def build_scene(

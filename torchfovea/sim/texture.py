@@ -3,6 +3,9 @@
 Each geom has its own place in one periodic volume of band-limited noise: three octaves, looked up at three scales a
 factor 8 apart, each turned so that no period lines up with a wall. An octave fades as its wavelength nears the pixel's
 footprint, hence far surfaces are smooth instead of aliased and two eyes see one colour.
+
+NumPy inside, but for one lookup: it keeps to the thread that calls it, whereas torch would start threads of its own in
+every thread that shades.
 """
 
 from __future__ import annotations
@@ -11,9 +14,9 @@ import math
 from functools import lru_cache
 from typing import NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import Tensor
 
 __all__ = ["Paint", "colour"]
 
@@ -24,10 +27,12 @@ _AMPLITUDES = (0.12, 0.14, 0.16, 0.17, 0.17, 0.15, 0.13, 0.12, 0.10)  # log albe
 _PIXEL_SIGMA = 0.45  # of a pixel's Gaussian footprint, in pixels
 _AMBIENT = 0.5
 _LIGHTS = ((0.35, 0.45, 0.82, 0.42), (-0.75, -0.35, 0.56, 0.16))  # direction and strength, in the world
+_WHITE = np.array([0.93, 0.91, 0.87], np.float32)
+_SILVER = np.array([0.62, 0.63, 0.66], np.float32)
 
 
 class Paint(NamedTuple):
-    """What each of G geoms looks like.
+    """What each of G geoms looks like; float32.
 
     Attributes:
         look: (G, 7), RGB; RGB mixed in at large scale; strength of the noise.
@@ -36,47 +41,44 @@ class Paint(NamedTuple):
         can: (G, 2), radius and half height of an upright can's label [m]; 0 for everything else.
     """
 
-    look: Tensor
-    offset: Tensor
-    centre: Tensor
-    can: Tensor
+    look: np.ndarray
+    offset: np.ndarray
+    centre: np.ndarray
+    can: np.ndarray
 
 
 @lru_cache(maxsize=1)
-def _volume() -> Tensor:
+def _volume() -> torch.Tensor:
     """The noise, (1, 4, S+1, S+1, S+1): three unit-variance octaves and a fourth, independent coarse one for colour."""
-    generator = torch.Generator().manual_seed(20180)
-    frequency = torch.fft.fftfreq(_SIZE)
-    radius = (
-        frequency[:, None, None] ** 2 + frequency[None, :, None] ** 2 + torch.fft.rfftfreq(_SIZE)[None, None, :] ** 2
-    ).sqrt()
-    octave = torch.log2(radius.clamp(min=1e-6))
+    rng = np.random.default_rng(20180)
+    f = np.fft.fftfreq(_SIZE)
+    radius = np.sqrt(f[:, None, None] ** 2 + f[None, :, None] ** 2 + np.fft.rfftfreq(_SIZE)[None, None, :] ** 2)
+    octave = np.log2(np.maximum(radius, 1e-6))
     bands = []
     for wavelength in (*_WAVELENGTHS, 24.0):
-        noise = torch.fft.rfftn(torch.randn(_SIZE, _SIZE, _SIZE, generator=generator))
-        window = torch.cos(math.pi / 2 * (octave + math.log2(wavelength)).clamp(-1, 1))
-        band = torch.fft.irfftn(noise * window, s=(_SIZE,) * 3)
+        noise = np.fft.rfftn(rng.standard_normal((_SIZE,) * 3))
+        band = np.fft.irfftn(noise * np.cos(math.pi / 2 * np.clip(octave + math.log2(wavelength), -1, 1)), (_SIZE,) * 3, axes=(0, 1, 2))
         bands.append(band / band.std())
-    volume = torch.stack(bands)[None]
     # one voxel more on each far side closes the period for linear interpolation
-    for axis in (2, 3, 4):
-        volume = torch.cat([volume, volume.narrow(axis, 0, 1)], axis)
+    volume = np.pad(np.stack(bands), ((0, 0), (0, 1), (0, 1), (0, 1)), mode="wrap")
     # a voxel's channels side by side: one cache line instead of four
-    return volume.to(memory_format=torch.channels_last_3d)
+    return torch.from_numpy(volume.astype(np.float32))[None].to(memory_format=torch.channels_last_3d)
 
 
 @lru_cache(maxsize=1)
-def _turns() -> Tensor:
+def _turns() -> np.ndarray:
     """A fixed rotation for each scale, (3, 3, 3)."""
-    generator = torch.Generator().manual_seed(7)
-    return torch.linalg.qr(torch.randn(3, 3, 3, generator=generator))[0]
+    return np.linalg.qr(np.random.default_rng(7).standard_normal((3, 3, 3)))[0].astype(np.float32)
 
 
-def _noise(points: Tensor, scale: int, channels: int) -> Tensor:
+def _noise(points: np.ndarray, scale: int, channels: int) -> np.ndarray:
     """Noise at points (N, 3) [m], (C, N)."""
-    place = points @ (_turns()[scale] / (_VOXELS_M[scale] * _SIZE))
-    grid = ((place - place.floor()) * 2 - 1)[None, None, None]
-    return F.grid_sample(_volume()[:, :channels], grid, align_corners=True)[0, :, 0, 0]
+    place = points @ (_turns()[scale] / np.float32(_VOXELS_M[scale] * _SIZE))
+    place -= np.floor(place)
+    place *= 2
+    place -= 1
+    grid = torch.from_numpy(place)[None, None, None]
+    return F.grid_sample(_volume()[:, :channels], grid, align_corners=True)[0, :, 0, 0].numpy()
 
 
 def _fading(scale: int) -> list[tuple[float, float]]:
@@ -91,84 +93,78 @@ def _widest(scale: int) -> float:
     return math.log(0.004 / amplitude) / decay
 
 
-def _octaves(noise: Tensor, spread: Tensor, scale: int) -> tuple[Tensor, Tensor]:
+def _octaves(noise: np.ndarray, spread: np.ndarray, scale: int) -> tuple[np.ndarray, np.ndarray]:
     """Sum (N,) of a scale's faded octaves, and its variance (N,)."""
-    value, power = torch.zeros_like(spread), torch.zeros_like(spread)
-    for wave, (amplitude, decay) in zip(noise, _fading(scale), strict=True):
-        fade = torch.exp(decay * spread) * amplitude
-        value.addcmul_(wave, fade)
-        power.addcmul_(fade, fade)
+    value, power = np.zeros_like(spread), np.zeros_like(spread)
+    for wave, (amplitude, decay) in zip(noise, _fading(scale), strict=False):
+        fade = np.exp(np.float32(decay) * spread) * np.float32(amplitude)
+        value += wave * fade
+        power += fade * fade
     return value, power
 
 
-def _smoothstep(x: Tensor) -> Tensor:
-    x = x.clamp(0, 1)
-    return x * x * (3 - 2 * x)
-
-
-def _label(local: Tensor, size: Tensor, footprint: Tensor, base: Tensor) -> Tensor:
+def _label(local: np.ndarray, size: np.ndarray, footprint: np.ndarray, base: np.ndarray) -> np.ndarray:
     """A can's albedo (N, 3): its own colour with a white wave around it, metal at both ends."""
     half = size[:, 1]
-    x, y, z = local.unbind(-1)
-    angle = torch.atan2(y, x)
+    x, y, z = local.T
+    angle = np.arctan2(y, x)
     height = z / half
-    blur = (footprint / half).clamp(min=1e-3)
+    blur = np.maximum(footprint / half, 1e-3)
 
-    def inside(distance: Tensor) -> Tensor:  # 1 well inside, 0 well outside, as wide a step as the footprint
-        return _smoothstep(0.5 + distance / (2 * blur))
+    def inside(distance: np.ndarray) -> np.ndarray:  # 1 well inside, 0 well outside, a step as wide as the footprint
+        s = np.clip(0.5 + distance / (2 * blur), 0, 1)
+        return (s * s * (3 - 2 * s))[:, None]
 
-    wave = 0.34 * torch.sin(angle + 0.9 * torch.sin(2 * angle))
-    ribbon = inside(0.13 - (height - wave).abs())
-    ribbon = torch.maximum(ribbon, inside(0.02 - (height - wave - 0.24).abs()))
-    metal = inside(height.abs() - 0.9)
-    white = base.new_tensor([0.93, 0.91, 0.87])
-    silver = base.new_tensor([0.62, 0.63, 0.66])
-    albedo = base + ribbon[:, None] * (white - base)
-    return albedo + metal[:, None] * (silver - albedo)
+    wave = 0.34 * np.sin(angle + 0.9 * np.sin(2 * angle))
+    ribbon = np.maximum(inside(0.13 - np.abs(height - wave)), inside(0.02 - np.abs(height - wave - 0.24)))
+    metal = inside(np.abs(height) - 0.9)
+    albedo = base + ribbon * (_WHITE - base)
+    return albedo + metal * (_SILVER - albedo)
 
 
-def colour(paint: Paint, geom: Tensor, point_w: Tensor, normal_w: Tensor, footprint_m: Tensor) -> Tensor:
+def colour(
+    paint: Paint, geom: np.ndarray, point_w: np.ndarray, normal_w: np.ndarray, footprint_m: np.ndarray
+) -> np.ndarray:
     """Colour of surface points, without any term that depends on the viewpoint but the pixel's own blur.
 
     Args:
         paint: of the scene.
         geom: (N,) which geom each point lies on, >= 0.
-        point_w: (N, 3) in the world [m].
+        point_w: (N, 3) in the world [m], float32 like all that follow.
         normal_w: (N, 3), outward.
         footprint_m: (N,) width of the pixel on the surface [m].
 
     Returns:
-        (N, 3) RGB in [0, 1], float32.
+        (N, 3) RGB in [0, 1].
     """
     solid = point_w + paint.offset[geom]
-    spread = (_PIXEL_SIGMA * footprint_m) ** 2
+    spread = (np.float32(_PIXEL_SIGMA) * footprint_m) ** 2
     look = paint.look[geom]
-    log_albedo, kept = torch.zeros_like(spread), torch.zeros_like(spread)
-    for scale in range(len(_VOXELS_M) - 1):
+    last = len(_VOXELS_M) - 1
+    coarse = _noise(solid, last, 4)
+    log_albedo, power = _octaves(coarse, spread, last)
+    for scale in range(last):
         # most pixels are too wide for the finest octaves: look up only those that are not
-        rows = (spread < _widest(scale)).nonzero()[:, 0]
-        if rows.numel() == 0:
+        rows = np.flatnonzero(spread < _widest(scale))
+        if len(rows) == 0:
             continue
-        if rows.numel() > 0.8 * spread.numel():
-            value, power = _octaves(_noise(solid, scale, 3), spread, scale)
-            log_albedo += value
-            kept += power
-        else:
-            value, power = _octaves(_noise(solid[rows], scale, 3), spread[rows], scale)
-            log_albedo.index_add_(0, rows, value)
-            kept.index_add_(0, rows, power)
-    coarse = _noise(solid, len(_VOXELS_M) - 1, 4)
-    value, power = _octaves(coarse[:3], spread, len(_VOXELS_M) - 1)
+        part = spread[rows]
+        value, own_power = _octaves(_noise(solid[rows], scale, 3), part, scale)
+        log_albedo[rows] += value
+        power[rows] += own_power
     base = look[:, :3]
-    albedo = base + 0.65 * torch.sigmoid(3 * coarse[3])[:, None] * (look[:, 3:6] - base)
-    rows = (paint.can[geom, 0] > 0).nonzero()[:, 0]
-    if rows.numel() > 0:
+    mix = np.float32(0.65) / (1 + np.exp(-3 * coarse[3]))
+    albedo = base + mix[:, None] * (look[:, 3:6] - base)
+    rows = np.flatnonzero(paint.can[geom, 0] > 0)
+    if len(rows) > 0:
         own = geom[rows]
         albedo[rows] = _label(point_w[rows] - paint.centre[own], paint.can[own], footprint_m[rows], albedo[rows])
     contrast = look[:, 6]
     # the mean of exp(noise) shrinks as octaves fade; put it back, or far walls would darken
-    gain = torch.exp(contrast * (log_albedo + value) - contrast * contrast * (kept + power) / 2)
-    light = torch.full_like(gain, _AMBIENT)
-    for *direction, strength in _LIGHTS:
-        light += strength * (normal_w @ normal_w.new_tensor(direction)).clamp(min=0)
-    return (albedo * (gain * light)[:, None]).clamp(0, 1)
+    gain = np.exp(contrast * log_albedo - contrast * contrast * power / 2)
+    light = np.full_like(gain, _AMBIENT)
+    for x, y, z, strength in _LIGHTS:
+        facing = normal_w @ np.array([x, y, z], np.float32)
+        light += np.float32(strength) * np.maximum(facing, 0)
+    albedo *= (gain * light)[:, None]
+    return np.clip(albedo, 0, 1, out=albedo)
