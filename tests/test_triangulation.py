@@ -13,10 +13,10 @@ from scipy.optimize import least_squares
 from torchfovea.camera import Fisheye, Pinhole
 from torchfovea.chart import cartesian_from_inverse_range, inverse_range_coordinates
 from torchfovea.correspondence import Correspondences
-from torchfovea.gaussian import Gaussian, unpack
-from torchfovea.head import Eyes, Gaze, Head, eyes, fixate, to_ego
+from torchfovea.gaussian import Gaussian, quadratic3, unpack
+from torchfovea.head import Eyes, Gaze, Head, cyclopean, eyes, fixate, to_ego
 from torchfovea.setting import SettingError
-from torchfovea.triangulation import observe, sigma_root, triangulate, triangulate_homogeneous
+from torchfovea.triangulation import observe, rig_frame, sigma_root, triangulate, triangulate_rectified
 from torchfovea.unscented import SigmaPoints
 
 HEAD = Head()
@@ -43,16 +43,47 @@ def cloud(
     return torch.stack([x, (u[:, 1] - 0.5) * x, (u[:, 2] - 0.5) * x], -1).to(dtype)
 
 
+def rig_rays(matches: Correspondences, pose: Eyes, camera=CAMERA) -> tuple[torch.Tensor, torch.Tensor]:
+    frame, _, _ = rig_frame(pose)
+    return (
+        to_ego(frame.mT @ pose.R_left, camera.rays(matches.left_px)),
+        to_ego(frame.mT @ pose.R_right, camera.rays(matches.right_px)),
+    )
+
+
 @given(seed=st.integers(0, 1000))
 def test_exact_rays_meet_at_the_point_in_both_forms(seed):
     points = cloud(20, seed)
     matches, pose = stereo(points, 0.1)
     left, right = to_ego(pose.R_left, CAMERA.rays(matches.left_px)), to_ego(pose.R_right, CAMERA.rays(matches.right_px))
     midpoint, front = triangulate(left, right, pose.t_left, pose.t_right)
-    x, w, ahead = triangulate_homogeneous(left, right, pose.t_left, pose.t_right)
+    frame, origin, baseline = rig_frame(pose)
+    x, w, ahead = triangulate_rectified(*rig_rays(matches, pose), baseline)
     assert bool(front.all() and ahead.all())
     torch.testing.assert_close(midpoint, points, rtol=1e-8, atol=1e-9)
-    torch.testing.assert_close(x / w[..., None], points, rtol=1e-8, atol=1e-9)
+    torch.testing.assert_close(to_ego(frame, x / w[..., None]) + origin, points, rtol=1e-8, atol=1e-9)
+
+
+def test_the_rig_frame_of_a_head_is_cyclopean():
+    gaze = Gaze(*(torch.tensor(a, dtype=torch.float64) for a in (0.4, 0.2, 0.3)))
+    frame, origin, baseline = rig_frame(eyes(HEAD, gaze))
+    want, middle = cyclopean(HEAD, gaze)
+    torch.testing.assert_close(frame, want)
+    torch.testing.assert_close(origin, middle)
+    assert baseline.item() == pytest.approx(HEAD.baseline_m)
+    apart = eyes(HEAD, gaze)
+    with pytest.raises(SettingError, match="baseline_m = 0"):
+        rig_frame(apart._replace(t_right=apart.t_left))
+
+
+def test_vertical_noise_does_not_touch_the_depth():
+    left = torch.tensor([[0.3, 0.5, 1.0]], dtype=torch.float64)
+    right = torch.tensor([[0.1, 0.5, 1.0]], dtype=torch.float64)
+    lifted = right + torch.tensor([0.0, 0.02, 0.0], dtype=torch.float64)
+    b = torch.tensor(0.2, dtype=torch.float64)
+    for other in (right, lifted):
+        x, w, _ = triangulate_rectified(left, other, b)
+        assert (x[0, 2] / w[0]).item() == pytest.approx(1.0)
 
 
 def test_skew_rays_midpoint_is_the_least_squares_point():
@@ -93,7 +124,7 @@ def test_parallel_and_diverging_rays_are_masked_or_beyond_infinity():
     tl, tr = torch.tensor([-0.1, 0, 0], dtype=torch.float64), torch.tensor([0.1, 0, 0], dtype=torch.float64)
     point, front = triangulate(left, right, tl, tr)
     assert front.tolist() == [False, False, True] and bool(torch.isfinite(point).all())
-    x, w, ahead = triangulate_homogeneous(left, right, tl, tr)
+    x, w, ahead = triangulate_rectified(left, right, torch.tensor(0.2, dtype=torch.float64))
     assert ahead.all() and w[0].item() == 0 and w[1] < 0 < w[2] and bool((x[..., 2] > 0).all())
     (point.sum() + x.sum() + w.sum()).backward()
     assert bool(torch.isfinite(left.grad).all())
@@ -124,7 +155,10 @@ def test_moments_match_monte_carlo(chart, camera):
     sample, front = triangulate(left, right, pose.t_left, pose.t_right)
     assert bool(front.all())
     if chart == "inverse_range":
-        x, w, _ = triangulate_homogeneous(left, right, pose.t_left, pose.t_right)
+        frame, origin, baseline = rig_frame(pose)
+        shaken = matches._replace(left_px=matches.left_px + noise[..., :2], right_px=matches.right_px + noise[..., 2:])
+        x, w, _ = triangulate_rectified(*rig_rays(shaken, pose, camera), baseline)
+        x = to_ego(frame, x) + w[..., None] * origin
         sample = inverse_range_coordinates(x, w, observed.direction)
     for i in range(2):
         want = np.cov(sample[:, i].numpy().T)
@@ -135,14 +169,19 @@ def test_moments_match_monte_carlo(chart, camera):
         )
 
 
-def test_charts_agree_to_first_order():
-    matches, pose = stereo(cloud(50, 5, farthest=1.5), 0.02)
-    inverse = observe(matches, pose, CAMERA, HALF)
-    cartesian = observe(matches, pose, CAMERA, HALF, chart="cartesian")
-    converted = cartesian_from_inverse_range(Gaussian(inverse.mean, inverse.cov), inverse.direction)
-    torch.testing.assert_close(converted.mean, cartesian.mean, rtol=1e-3, atol=1e-4)
-    relative = (converted.cov - cartesian.cov).norm(dim=-1) / cartesian.cov.norm(dim=-1)
-    assert relative.max() < 0.01
+def test_charts_agree_near_the_axis_and_inverse_range_is_no_worse_beside_it():
+    """Beside the axis the midpoint lets vertical noise into the depth; rectified disparity does not."""
+    points = cloud(50, 5, farthest=1.5)
+    for spread, tolerance in ((0.1, 2e-3), (1.0, 0.05)):
+        matches, pose = stereo(points * torch.tensor([1, spread, spread], dtype=torch.float64), 0.02)
+        inverse = observe(matches, pose, CAMERA, HALF)
+        cartesian = observe(matches, pose, CAMERA, HALF, chart="cartesian")
+        converted = cartesian_from_inverse_range(Gaussian(inverse.mean, inverse.cov), inverse.direction)
+        torch.testing.assert_close(converted.mean, cartesian.mean, rtol=1e-3, atol=1e-4)
+        relative = (converted.cov - cartesian.cov).norm(dim=-1) / cartesian.cov.norm(dim=-1)
+        assert relative.max() < tolerance
+        along = [quadratic3(c.cov, inverse.direction) for c in (converted, cartesian)]
+        assert bool((along[0] < along[1] * 1.001).all())
 
 
 def test_infinity_is_an_ordinary_place_in_inverse_range_only():

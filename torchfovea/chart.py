@@ -29,7 +29,7 @@ __all__ = [
 def _dot(a: Tensor, b: Tensor) -> Tensor:
     x, y, z = a.unbind(-1)
     u, v, w = b.unbind(-1)
-    return x * u + y * v + z * w
+    return torch.addcmul(torch.addcmul(x * u, y, v), z, w)
 
 
 def basis(direction: Tensor) -> tuple[Tensor, Tensor]:
@@ -47,22 +47,25 @@ def basis(direction: Tensor) -> tuple[Tensor, Tensor]:
     return columns(1 + sign * x * x * a, sign * b, -sign * x), columns(b, sign + y * y * a, -y)
 
 
-def inverse_range_coordinates(homogeneous: Tensor, weight: Tensor, direction: Tensor) -> Tensor:
+def inverse_range_coordinates(
+    homogeneous: Tensor, weight: Tensor, direction: Tensor, tangents: tuple[Tensor, ...] | None = None
+) -> Tensor:
     """Coordinates (a, b, ρ) of the points homogeneous/weight.
 
     Args:
         homogeneous: (..., 3) in E, finite and in front (a point at infinity has weight 0).
         weight: (...), negative beyond infinity.
         direction: nominal unit directions, broadcastable to (..., 3).
+        tangents: e₁ and e₂ where they are known in the frame of the points; None: `basis(direction)`.
 
     Returns:
         (..., 3). Differentiable in all.
     """
-    e1, e2 = basis(direction)
-    ahead = _dot(direction, homogeneous)
+    e1, e2 = tangents or basis(direction)
+    ahead = 1 / _dot(direction, homogeneous)
     return columns(
-        _dot(e1, homogeneous) / ahead,
-        _dot(e2, homogeneous) / ahead,
+        _dot(e1, homogeneous) * ahead,
+        _dot(e2, homogeneous) * ahead,
         weight * _dot(homogeneous, homogeneous).rsqrt(),
     )
 

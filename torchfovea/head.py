@@ -139,7 +139,7 @@ def to_ego(rotation: Tensor, vector: Tensor) -> Tensor:
     """
     x, y, z = vector.unbind(-1)
     row = [[rotation[..., i, j].unsqueeze(-1) for j in range(3)] for i in range(3)]
-    return columns(*(r[0] * x + r[1] * y + r[2] * z for r in row))
+    return columns(*(torch.addcmul(torch.addcmul(r[0] * x, r[1], y), r[2], z) for r in row))
 
 
 def fixate(head: Head, point: Tensor) -> tuple[Gaze, Tensor]:

@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 
 from torchfovea.camera import Camera
-from torchfovea.chart import inverse_range_coordinates
+from torchfovea.chart import basis, inverse_range_coordinates
 from torchfovea.correspondence import Correspondences
 from torchfovea.gaussian import columns, positive_definite
-from torchfovea.head import Eyes, to_ego
+from torchfovea.head import Eyes, to_ego as turn
 from torchfovea.setting import require
 from torchfovea.unscented import SigmaPoints, unscented_transform
 
-__all__ = ["Observations", "observe", "sigma_root", "triangulate", "triangulate_homogeneous"]
+__all__ = ["Observations", "observe", "rig_frame", "sigma_root", "triangulate", "triangulate_rectified"]
 
 
 class Observations(NamedTuple):
@@ -73,36 +73,66 @@ def triangulate(left: Tensor, right: Tensor, t_left: Tensor, t_right: Tensor) ->
     return torch.where(in_front[..., None], point, torch.ones_like(point)), in_front
 
 
-def triangulate_homogeneous(
-    left: Tensor, right: Tensor, t_left: Tensor, t_right: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The midpoint method on the rays' common epipolar plane, as a homogeneous point.
+def triangulate_rectified(left: Tensor, right: Tensor, baseline_m: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The point between two rays in the rig's own frame, in homogeneous form: depth from horizontal disparity alone.
 
-    With the plane's normal m = b × (dₗ + dᵣ) for unit rays, s = (b × dᵣ)·m/(c·m) and t = (b × dₗ)·m/(c·m). The two
-    agree with `triangulate` where the rays meet, but numerator and denominator stay finite and keep their signs through
-    parallel rays, where the shortest segment between skew rays would jump toward the eyes.
+    With the eyes at ∓b/2 on the x axis, rays (x, y, z) and (x', y', z'):
+
+        X = b/2 (x z' + x' z, y z' + y' z, 2 z z'),   w = x z' − x' z.
+
+    It is `triangulate` where the rays meet. Where noise keeps them apart it leaves the vertical mismatch out of the depth
+    (which is what the likelihood of isotropic noise on a rectified pair says), and numerator and denominator keep their
+    signs through parallel rays, where the shortest segment between skew rays would jump toward the eyes.
 
     Args:
-        left: directions dₗ (..., 3) of any length, in one frame with all others.
-        right: directions dᵣ (..., 3).
-        t_left: the left eye's centre, broadcastable to (..., 3) [m].
-        t_right: the right eye's centre.
+        left: directions (..., 3) of any length, x along the baseline from left to right, z ahead.
+        right: directions (..., 3).
+        baseline_m: broadcastable to (...).
 
     Returns:
-        X (..., 3) and w (...), the point being X/w (w < 0 beyond infinity), and whether the rays look ahead, so that X
-        points forward: bool (...).
+        X (..., 3) and w (...), the point being X/w about the baseline's middle (w < 0 beyond infinity), and whether both
+        rays look ahead: bool (...). Where they do not, X and w are finite and meaningless.
 
     Differentiable.
     """
-    baseline = t_right - t_left
-    unit = (left * left).sum(-1, keepdim=True).rsqrt() * left + (right * right).sum(-1, keepdim=True).rsqrt() * right
-    normal = _cross(baseline, unit)
-    normal = normal * (normal * normal).sum(-1, keepdim=True).clamp(min=1e-24).rsqrt()
-    w = (_cross(left, right) * normal).sum(-1)
-    s, t = (_cross(baseline, right) * normal).sum(-1), (_cross(baseline, left) * normal).sum(-1)
-    ahead = (s > 0) & (t > 0)
-    x = (s[..., None] * left + t[..., None] * right + w[..., None] * (t_left + t_right)) / 2
-    return torch.where(ahead[..., None], x, torch.ones_like(x)), torch.where(ahead, w, torch.ones_like(w)), ahead
+    xl, yl, zl = left.unbind(-1)
+    xr, yr, zr = right.unbind(-1)
+    ahead = (zl > 0) & (zr > 0)
+    across, back = xl * zr, xr * zl
+    half = baseline_m / 2
+    x = columns(half * (across + back), half * torch.addcmul(yl * zr, yr, zl), baseline_m * (zl * zr))
+    w = across - back
+    if not bool(ahead.all()):
+        x = torch.where(ahead[..., None], x, torch.ones_like(x))
+        w = torch.where(ahead, w, torch.ones_like(w))
+    return x, w, ahead
+
+
+def rig_frame(eyes: Eyes) -> tuple[Tensor, Tensor, Tensor]:
+    """The rectified frame of two eyes: x along the baseline to the right, z midway between the optical axes.
+
+    For a head it is the cyclopean frame.
+
+    Args:
+        eyes: poses in E, (...).
+
+    Returns:
+        Its axes in E as the columns of R (..., 3, 3), its origin midway between the eyes t (..., 3) and the baseline
+        (...) [m].
+
+    Raises:
+        SettingError: for a baseline of no length.
+
+    Differentiable.
+    """
+    across = eyes.t_right - eyes.t_left
+    baseline = across.square().sum(-1).sqrt()
+    require(bool((baseline > 0).all()), "baseline_m", 0.0, "eyes some distance apart")
+    x = across / baseline[..., None]
+    z = eyes.R_left[..., 2] + eyes.R_right[..., 2]
+    z = z - (z * x).sum(-1, keepdim=True) * x
+    z = z / z.square().sum(-1, keepdim=True).sqrt()
+    return torch.stack([x, torch.linalg.cross(z, x), z], -1), (eyes.t_left + eyes.t_right) / 2, baseline
 
 
 def sigma_root(left_sigma: Tensor, right_sigma: Tensor, rotated: bool = True) -> Tensor:
@@ -168,29 +198,36 @@ def observe(
     """
     require(chart in ("inverse_range", "cartesian"), "chart", chart, "inverse_range or cartesian")
     points = points or SigmaPoints()
-    mean = torch.cat([matches.left_px, matches.right_px], -1)
-    t_left, t_right = eyes.t_left.unsqueeze(-2), eyes.t_right.unsqueeze(-2)
+    mean = columns(*matches.left_px.unbind(-1), *matches.right_px.unbind(-1))
+    in_front = torch.ones((), dtype=torch.bool)
+    direction = torch.empty(())
+    frame, origin, baseline = rig_frame(eyes)
+    to_left, to_right = frame.mT @ eyes.R_left, frame.mT @ eyes.R_right
 
     def rays(px: Tensor) -> tuple[Tensor, Tensor]:
         left, right = camera.rays(px[..., :2]), (right_camera or camera).rays(px[..., 2:])
-        return to_ego(eyes.R_left, left), to_ego(eyes.R_right, right)
+        return turn(to_left, left), turn(to_right, right)
 
-    in_front = torch.ones((), dtype=torch.bool)
-    direction = torch.empty(())
-
-    def through(px: Tensor) -> Tensor:
+    def cartesian(px: Tensor) -> Tensor:
         nonlocal in_front, direction
-        left, right = rays(px)
-        if chart == "cartesian":
-            point, in_front = triangulate(left, right, t_left, t_right)
-            direction = point[0] * (point[0] * point[0]).sum(-1, keepdim=True).rsqrt()
-            return point
-        x, w, in_front = triangulate_homogeneous(left, right, t_left, t_right)
-        direction = x[0] * (x[0] * x[0]).sum(-1, keepdim=True).rsqrt()
-        return inverse_range_coordinates(x, w, direction)
+        half = torch.stack([baseline / 2, torch.zeros_like(baseline), torch.zeros_like(baseline)], -1).unsqueeze(-2)
+        point, in_front = triangulate(*rays(px), -half, half)
+        point = turn(frame, point) + origin.unsqueeze(-2)
+        direction = point[0] * (point[0] * point[0]).sum(-1, keepdim=True).rsqrt()
+        return point
+
+    def inverse_range(px: Tensor) -> Tensor:
+        nonlocal in_front, direction
+        x, w, in_front = triangulate_rectified(*rays(px), baseline.unsqueeze(-1))
+        # the origin of E, seen in the rig's axes: there the sigma points stay, and the few directions come to them
+        shift = turn(frame.mT, origin.unsqueeze(-2))
+        x = torch.addcmul(x, w[..., None], shift)
+        ahead = x[0] * (x[0] * x[0]).sum(-1, keepdim=True).rsqrt()
+        direction = turn(frame, ahead)
+        return inverse_range_coordinates(x, w, ahead, tuple(turn(frame.mT, e) for e in basis(direction)))
 
     root = sigma_root(matches.left_sigma_px, matches.right_sigma_px, rotated)
-    value, cov, _ = unscented_transform(through, mean, root, points)
+    value, cov, _ = unscented_transform(cartesian if chart == "cartesian" else inverse_range, mean, root, points)
     valid = matches.valid & in_front.all(0) & positive_definite(cov) & torch.isfinite(value).all(-1)
     safe = columns(*(torch.full_like(valid, float(k in (0, 3, 5)), dtype=cov.dtype) for k in range(6)))
     centre = camera.rays(matches.left_px)
