@@ -1,33 +1,48 @@
 """The sensory ego-sphere: what the observer knows, one Gaussian for each direction cell (Sec. 5).
 
+In the Cartesian charts a cell holds the point (x, y, z), as printed. In inverse range it holds a *patch*, the plane
+q·X = 1 around its direction p. Seen from E, inverse range is linear in the direction, ρ(u) = q·u, so that observations
+on different rays of one cell enter exactly, wherever in the cell they fall; a slanted floor neither biases the range
+nor passes for noise. In the cell's own frame (e₁, e₂, p) the state is (g₁, g₂, ρ), the slope of the inverse range and
+the inverse range itself; an observation of ρ in direction u is the row (u·e₁, u·e₂, u·p) of a linear filter.
+
 One saccade's observations enter in three moves. *Pool*: the observations of a cell add up in information form, as the
-paper fuses all (Eq. 34-35). *Add*: what they share, and no averaging removes, is added to the pooled covariance. *Fuse*:
-the result joins the memory. With nothing shared the three are exactly Eq. 34-35.
+paper fuses all (Eq. 34-35). *Add*: what they share, and no averaging removes, is added to the pooled covariance.
+*Fuse*: the result joins the memory.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchfovea.chart import cartesian_from_inverse_range, turn_cartesian, turn_inverse_range
-from torchfovea.gaussian import (
-    Gaussian,
-    Information,
-    columns,
-    gaussian_from_information,
-    information_from_gaussian,
-    inverse3,
-    times3,
-)
-from torchfovea.nearest import CellIndex, nearest_cell, nearest_observation
+from torchfovea.association import Pairs, associate, gather_columns, in_front
+from torchfovea.chart import basis, turn_cartesian
+from torchfovea.gaussian import Gaussian, Information, columns, gaussian_from_information
+from torchfovea.nearest import CellIndex
+from torchfovea.pooling import Pooled, add_common, found_points, nearness, pool, pool_patches
 from torchfovea.setting import require
 from torchfovea.triangulation import Observations
 
-__all__ = ["EgoSphere", "Fusion", "Prior", "belief", "cartesian_belief", "fuse", "new_egosphere", "pool", "remember"]
+__all__ = [
+    "EgoSphere",
+    "Fusion",
+    "Prior",
+    "belief",
+    "cartesian_belief",
+    "cartesian_from_patches",
+    "forget",
+    "fuse",
+    "new_egosphere",
+    "prior_information",
+    "remember",
+    "settle",
+]
 
 
 class EgoSphere(NamedTuple):
@@ -35,12 +50,14 @@ class EgoSphere(NamedTuple):
 
     Attributes:
         cells: unit directions in E, (..., Nx, 3) (Eq. 20).
-        information: vector (..., Nx, 3) and packed matrix (..., Nx, 6) in the fusion's chart.
+        information: vector (..., Nx, 3) and packed matrix (..., Nx, 6), of (x, y, z) or of a patch (g₁, g₂, ρ).
+        bearing: how well the patches' places across the line of sight are known [1/rad²], (..., Nx); zero in x, y, z.
         looks: how many saccades brought each cell something, (..., Nx); 0 is unseen.
     """
 
     cells: Tensor
     information: Information
+    bearing: Tensor
     looks: Tensor
 
 
@@ -49,19 +66,23 @@ class Prior:
     """What a cell believes before it is seen.
 
     Attributes:
-        mean: range along the cell [m] in the Cartesian chart, inverse range [1/m] in the other.
+        mean: range along the cell [m] in the Cartesian charts, inverse range [1/m] in the other.
         std: the same unit; the Cartesian prior is isotropic.
-        bearing_std: of the two bearing offsets, inverse range only.
+        bearing_std: across the line of sight [rad], inverse range only.
+        slope_std: of the inverse range over the angle [1/m/rad], inverse range only. A plane at distance d from E has a
+            slope of at most 1/d.
     """
 
     mean: float = 0.4
     std: float = 0.4
     bearing_std: float = 0.1
+    slope_std: float = 1.5
 
     def __post_init__(self) -> None:
         """Raise SettingError unless all are positive."""
-        for name in ("mean", "std", "bearing_std"):
-            require(getattr(self, name) > 0, f"prior.{name}", getattr(self, name), "a positive number")
+        for name in ("mean", "std", "bearing_std", "slope_std"):
+            value = getattr(self, name)
+            require(0 < value < math.inf, f"prior.{name}", value, "a positive number")
 
 
 @dataclass(frozen=True)
@@ -69,32 +90,52 @@ class Fusion:
     """How observations enter the memory.
 
     Attributes:
-        name: `inverse_range` (aligned, in that chart), `aligned` (each observation first turned onto its cell's
-            direction, Cartesian) or `printed` (the paper's, Cartesian, without the turn: it pulls toward the eye).
+        name: `inverse_range` (patches), `aligned` (each observation first turned onto its cell's direction, Cartesian)
+            or `printed` (the paper's, Cartesian, without the turn: it pulls toward the eye).
         gate_deg: observations farther than this from their cell are dropped, unless their receptive field covers it.
         gate_spacing: the gate is at least this many times the cell's distance to its neighbour.
-        slant: a cell is a patch, not a point. An observation off the cell's direction by δ sees the range of another
-            place on it; this adds (slant · δ)² to the relative variance of its range. 0: none, as printed.
         fill: whether a cell within a receptive field's cover that got no observation takes the nearest one.
+        conflict: patches only. Two inverse ranges this many standard deviations apart are two surfaces, and E sees the
+            nearer one alone; inf: they are averaged.
+        erode: the share of its information that a cell keeps when a saccade sees past it: once it is the eyes'
+            parallax, again and again the memory was wrong.
+        half_life: saccades after which half of the information is forgotten; inf: never.
     """
 
     name: str = "inverse_range"
     gate_deg: float = 0.8
     gate_spacing: float = 2.0
-    slant: float = 1.0
     fill: bool = True
+    conflict: float = 4.0
+    erode: float = 0.5
+    half_life: float = math.inf
 
     def __post_init__(self) -> None:
-        """Raise SettingError for an unknown name or a negative size."""
+        """Raise SettingError for an unknown name or a size out of range."""
         names = ("inverse_range", "aligned", "printed")
         require(self.name in names, "fusion", self.name, "one of " + ", ".join(names))
-        for name in ("gate_deg", "gate_spacing", "slant"):
-            require(getattr(self, name) >= 0, f"fusion.{name}", getattr(self, name), "at least 0")
+        for name in ("gate_deg", "gate_spacing"):
+            require(0 <= getattr(self, name) < math.inf, f"fusion.{name}", getattr(self, name), "at least 0")
+        require(self.conflict > 0, "fusion.conflict", self.conflict, "a positive number of standard deviations")
+        require(0 <= self.erode <= 1, "fusion.erode", self.erode, "a share from 0 to 1")
+        require(self.half_life > 0, "fusion.half_life", self.half_life, "a positive number of saccades")
 
     @property
     def chart(self) -> str:
         """The chart that the memory is kept in."""
         return "inverse_range" if self.name == "inverse_range" else "cartesian"
+
+
+def prior_information(cells: Tensor, prior: Prior, chart: str = "inverse_range") -> tuple[Information, Tensor]:
+    """What every cell believes at first, and its bearing precision, in the shapes of `EgoSphere`."""
+    zero = torch.zeros_like(cells[..., 0])
+    weight = torch.full_like(zero, prior.std**-2)
+    if chart == "cartesian":
+        matrix = columns(weight, zero, zero, weight, zero, weight)
+        return Information(columns(*(prior.mean * weight * c for c in cells.unbind(-1))), matrix), zero
+    slope = torch.full_like(zero, prior.slope_std**-2)
+    information = Information(columns(zero, zero, prior.mean * weight), columns(slope, zero, zero, slope, zero, weight))
+    return information, torch.full_like(zero, prior.bearing_std**-2)
 
 
 def new_egosphere(cells: Tensor, prior: Prior, chart: str = "inverse_range") -> EgoSphere:
@@ -110,126 +151,68 @@ def new_egosphere(cells: Tensor, prior: Prior, chart: str = "inverse_range") -> 
 
     Differentiable in the cells.
     """
-    require(cells.shape[-1] == 3 and cells.dim() >= 2, "cells", tuple(cells.shape), "a shape (..., cells, 3)")
-    require(cells.shape[-2] > 0, "memory.cells", cells.shape[-2], "at least 1")
+    require(cells.dim() >= 2 and cells.shape[-1] == 3, "cells", tuple(cells.shape), "a shape (..., cells, 3)")
+    require(cells.numel() > 0, "memory.cells", cells.shape[-2], "at least 1")
     unit = bool(((cells * cells).sum(-1) - 1).abs().max() < 1e-3)
     require(unit, "cells", "directions", "finite unit vectors")
-    variance = torch.full_like(cells[..., 0], prior.std**2)
-    zero = torch.zeros_like(variance)
-    if chart == "cartesian":
-        gaussian = Gaussian(prior.mean * cells, columns(variance, zero, zero, variance, zero, variance))
-    else:
-        bearing = torch.full_like(variance, prior.bearing_std**2)
-        mean = columns(zero, zero, torch.full_like(variance, prior.mean))
-        gaussian = Gaussian(mean, columns(bearing, zero, zero, bearing, zero, variance))
-    return EgoSphere(cells, information_from_gaussian(gaussian), torch.zeros_like(variance))
+    return EgoSphere(cells, *prior_information(cells, prior, chart), torch.zeros_like(cells[..., 0]))
 
 
-def _gather(values: Tensor, index: Tensor) -> Tensor:
-    """values (..., Nx, k) at index (..., N) as columns (..., N, k)."""
-    return columns(*(value.gather(-1, index) for value in values.unbind(-1)))
+def settle(memory: EgoSphere, pooled: Pooled, fusion: Fusion, prior: Prior) -> tuple[EgoSphere, Pooled]:
+    """A z-buffer between what is remembered and what a saccade brought; patches only.
 
+    Where the two are `fusion.conflict` standard deviations apart they are two surfaces. If the new one is nearer, the
+    cell forgets the old one, which it hides. If it is farther, the eyes looked past the old one: the new one is not
+    entered, and the old one keeps the share `fusion.erode` of its information.
 
-def _assign(
-    memory: EgoSphere, index: CellIndex, spacing_rad: Tensor, observed: Observations, fusion: Fusion
-) -> tuple[Observations, Tensor]:
-    """Pair observations with cells (Eq. 23): each with its nearest, then each empty covered cell with its nearest.
-
-    Returns observations, as many as pairs, and their cells; pairs out of the gate are invalid.
+    Differentiable; which is nearer is held fixed.
     """
-    cell, cosine = nearest_cell(index, observed.direction)
-    angle = torch.acos(cosine.clamp(-1, 1))
-    gate = torch.maximum(
-        (fusion.gate_spacing * spacing_rad.gather(-1, cell)).clamp(min=fusion.gate_deg * torch.pi / 180),
-        observed.support_rad,
+    first, bearing = prior_information(memory.cells, prior)
+    seen = (memory.looks > 0) & (pooled.count > 0)
+    slope, flat = prior.slope_std**-2, torch.zeros_like(bearing)
+    weak = torch.where(seen, flat, torch.ones_like(flat))
+    matrix = pooled.information.matrix + columns(flat + slope, flat, flat, flat + slope, flat, weak)
+    with torch.no_grad():
+        new, new_variance = nearness(Information(pooled.information.vector, matrix))
+        old, old_variance = nearness(memory.information)
+        apart = (new - old) * (new_variance + old_variance).rsqrt()
+        nearer, farther = seen & (apart > fusion.conflict), seen & (apart < -fusion.conflict)
+        keep = torch.where(nearer, flat, torch.where(farther, flat + fusion.erode, flat + 1))
+    memory = _blend(memory, first, bearing, keep)
+    take = (~farther).to(flat.dtype)
+    information = Information(*(take[..., None] * part for part in pooled.information))
+    return memory, Pooled(information, take * pooled.bearing, take * pooled.count)
+
+
+def _blend(memory: EgoSphere, first: Information, bearing: Tensor, keep: Tensor) -> EgoSphere:
+    """Keep a share (..., Nx) of what was learned; the rest is the prior's."""
+    weight = keep[..., None]
+    information = Information(
+        *(then + weight * (now - then) for now, then in zip(memory.information, first, strict=True))
     )
-    paired = observed._replace(valid=observed.valid & (angle <= gate))
-    if not fusion.fill:
-        return paired, cell
-    got = torch.zeros_like(memory.looks).scatter_add(-1, cell, paired.valid.to(memory.looks.dtype)) > 0
-    usable = torch.where(observed.valid[..., None], observed.direction, torch.zeros_like(observed.direction))
-    nearest, cosine = nearest_observation(usable, memory.cells)
-    angle = torch.acos(cosine.clamp(-1, 1))
-    gate = observed.support_rad.gather(-1, nearest).clamp(min=fusion.gate_deg * torch.pi / 180)
-    extra = Observations(
-        _gather(observed.mean, nearest),
-        _gather(observed.cov, nearest),
-        _gather(observed.direction, nearest),
-        observed.support_rad.gather(-1, nearest),
-        ~got & (angle <= gate) & observed.valid.gather(-1, nearest),
-    )
-    every = torch.arange(memory.cells.shape[-2], device=cell.device).expand(nearest.shape)
-    axes = (-2, -2, -2, -1, -1)
-    both = (torch.cat(pair, axis) for pair, axis in zip(zip(paired, extra, strict=True), axes, strict=True))
-    return Observations(*both), torch.cat([cell, every], -1)
+    return memory._replace(information=information, bearing=bearing + keep * (memory.bearing - bearing))
 
 
-def _onto_cells(observed: Observations, target: Tensor, fusion: Fusion) -> Gaussian:
-    """Observations as Gaussians about their cells' directions, with the patch's own scatter along the range."""
-    gaussian = Gaussian(observed.mean, observed.cov)
-    square = ((observed.direction - target) ** 2).sum(-1) * fusion.slant**2
-    if fusion.chart == "inverse_range":
-        turned = turn_inverse_range(gaussian, observed.direction, target)
-        aa, ab, ar, bb, br, rr = turned.cov.unbind(-1)
-        rho = turned.mean[..., 2]
-        return Gaussian(turned.mean, columns(aa, ab, ar, bb, br, rr + square * rho * rho))
-    if fusion.name == "aligned":
-        gaussian = turn_cartesian(gaussian, observed.direction, target)
-    if fusion.slant == 0:
-        return gaussian
-    x, y, z = gaussian.mean.unbind(-1)
-    scatter = square[..., None] * columns(x * x, x * y, x * z, y * y, y * z, z * z)
-    return gaussian._replace(cov=gaussian.cov + scatter)
-
-
-def pool(gaussian: Gaussian, cell: Tensor, valid: Tensor, cells: int) -> tuple[Information, Tensor]:
-    """Add up the information of one saccade's observations, cell by cell (Eq. 34-35 without the memory).
+def forget(memory: EgoSphere, prior: Prior, chart: str, keep: float | Tensor) -> EgoSphere:
+    """Let information decay toward the prior.
 
     Args:
-        gaussian: (..., N, 3) and (..., N, 6), about their cells' directions.
-        cell: (..., N) int64.
-        valid: bool (..., N); the others count nothing.
-        cells: Nx.
+        memory: before.
+        prior: what a cell believes that knows nothing.
+        chart: of the memory.
+        keep: the share that remains, 0 to 1, broadcastable to (..., Nx); for a half-life of h saccades 0.5^(1/h).
 
-    Returns:
-        Information (..., Nx, 3) and (..., Nx, 6), zero where nothing came, and the number of observations (..., Nx).
-
-    Differentiable in the Gaussians.
+    Differentiable. Seen cells stay seen.
     """
-    information = information_from_gaussian(gaussian)
-    weight = valid.to(gaussian.mean.dtype)
-    parts = torch.cat([information.vector, information.matrix, weight[..., None]], -1)
-    parts = torch.where(valid[..., None], parts, torch.zeros_like(parts))
-    batch = valid.shape[:-1]
-    offset = torch.arange(batch.numel(), device=cell.device).reshape(*batch, 1) * cells
-    total = torch.zeros(batch.numel() * cells, 10, dtype=parts.dtype, device=parts.device)
-    total = total.index_add(0, (cell + offset).flatten(), parts.reshape(-1, 10)).reshape(*batch, cells, 10)
-    return Information(total[..., :3], total[..., 3:9]), total[..., 9]
+    share = torch.as_tensor(keep, dtype=memory.cells.dtype, device=memory.cells.device)
+    require(bool(((share >= 0) & (share <= 1)).all()), "keep", keep, "a share from 0 to 1")
+    return _blend(memory, *prior_information(memory.cells, prior, chart), share.expand(memory.looks.shape))
 
 
-def fuse(memory: EgoSphere, pooled: Information, count: Tensor, common: Tensor | None = None) -> EgoSphere:
-    """Join one saccade's pooled observations with the memory.
-
-    Args:
-        memory: (..., Nx).
-        pooled: their information, see `pool`.
-        count: observations of each cell (..., Nx); 0 leaves the cell as it was.
-        common: packed covariance (..., Nx, 6) that all observations of the saccade share (encoder errors), or None.
-
-    Differentiable.
-    """
-    seen = count > 0
-    if common is not None:
-        one = torch.tensor([0.0, 0, 0, 0, 0, 0], dtype=common.dtype, device=common.device)
-        one[[0, 3, 5]] = 1
-        matrix = torch.where(seen[..., None], pooled.matrix, one)
-        moments = gaussian_from_information(Information(pooled.vector, matrix))
-        matrix = inverse3(moments.cov + common)
-        pooled = Information(times3(matrix, moments.mean), matrix)
-    keep = seen[..., None]
-    vector = memory.information.vector + torch.where(keep, pooled.vector, torch.zeros_like(pooled.vector))
-    matrix = memory.information.matrix + torch.where(keep, pooled.matrix, torch.zeros_like(pooled.matrix))
-    return EgoSphere(memory.cells, Information(vector, matrix), memory.looks + seen)
+def fuse(memory: EgoSphere, pooled: Pooled) -> EgoSphere:
+    """Join one saccade's pooled observations with the memory (Eq. 34-35). Differentiable."""
+    information = Information(*(old + new for old, new in zip(memory.information, pooled.information, strict=True)))
+    return EgoSphere(memory.cells, information, memory.bearing + pooled.bearing, memory.looks + (pooled.count > 0))
 
 
 def remember(
@@ -238,7 +221,8 @@ def remember(
     spacing_rad: Tensor,
     observed: Observations,
     fusion: Fusion,
-    common: Tensor | None = None,
+    prior: Prior,
+    common: Tensor | Callable[[Tensor], Tensor] | None = None,
 ) -> EgoSphere:
     """Enter one saccade's observations: associate (Eq. 22-23), pool, add, fuse (Eq. 34-35).
 
@@ -246,25 +230,86 @@ def remember(
         memory: the ego-sphere before.
         index: of its cells, from `torchfovea.nearest.build_index`.
         spacing_rad: distance of each cell to its neighbours (..., Nx).
-        observed: in the fusion's chart.
+        observed: in the fusion's chart; see `associate` for what is left out.
         fusion: how.
-        common: see `fuse`.
+        prior: what the memory began with.
+        common: packed covariance (..., Nx, 6) that the saccade's observations share, see `add_common`; or a function
+            that gives it for the points (..., Nx, 3) which the saccade found, see `torchfovea.encoders`.
 
     Returns:
         The ego-sphere after. Differentiable in the observations (the association is held fixed).
     """
-    pairs, cell = _assign(memory, index, spacing_rad, observed, fusion)
-    gaussian = _onto_cells(pairs, _gather(memory.cells, cell), fusion)
-    pooled, count = pool(gaussian, cell, pairs.valid, memory.cells.shape[-2])
-    return fuse(memory, pooled, count, common)
+    cells, batch, chart = memory.cells, memory.cells.shape[:-2], fusion.chart
+    if fusion.half_life < math.inf:
+        memory = forget(memory, prior, chart, 0.5 ** (1 / fusion.half_life))
+    gate_rad = math.radians(fusion.gate_deg)
+    pairs = associate(cells, index, spacing_rad, observed, gate_rad, fusion.gate_spacing, fusion.fill)
+    target = gather_columns(cells, pairs.cell)
+    direction = gather_columns(observed.direction, pairs.observation)
+    if chart == "cartesian":
+        gaussian = Gaussian(*(gather_columns(part, pairs.observation) for part in (observed.mean, observed.cov)))
+        if fusion.name == "aligned":
+            gaussian = turn_cartesian(gaussian, direction, target)
+        pooled = pool(gaussian, pairs.cell, batch, cells.shape[-2])
+    else:
+        pooled = _pool_in_front(observed, direction, target, pairs, cells, fusion, prior)
+    if common is not None:
+        if callable(common):
+            common = common(found_points(pooled, cells, chart, prior.slope_std))
+        pooled = add_common(pooled, common, chart, prior.slope_std)
+    if chart == "inverse_range" and fusion.conflict < math.inf:
+        memory, pooled = settle(memory, pooled, fusion, prior)
+    return fuse(memory, pooled)
+
+
+def _pool_in_front(
+    observed: Observations, direction: Tensor, target: Tensor, pairs: Pairs, cells: Tensor, fusion: Fusion, prior: Prior
+) -> Pooled:
+    """Pool inverse ranges, without those that another of the same cell hides from E."""
+    aa, _, _, bb, _, rr = (part.reshape(-1).index_select(0, pairs.observation) for part in observed.cov.unbind(-1))
+    rho = observed.mean[..., 2].reshape(-1).index_select(0, pairs.observation)
+    across = aa + bb
+    # seen in a direction that is itself uncertain: on a slope the inverse range is so too
+    variance = rr + prior.slope_std**2 * across
+    row = columns(*((direction * axis).sum(-1) for axis in (*basis(target), target)))
+    batch, count = cells.shape[:-2], cells.shape[-2]
+    keep = torch.ones_like(rho)
+    if fusion.conflict < math.inf:
+        with torch.no_grad():
+            off = row[..., 0] ** 2 + row[..., 1] ** 2
+            std = (variance + prior.slope_std**2 * off).sqrt()
+            keep = in_front(rho, std, pairs.cell, batch.numel() * count, fusion.conflict).to(rho.dtype)
+    return pool_patches(rho, variance, 2 / across, row, keep, pairs.cell, batch, count)
 
 
 def belief(memory: EgoSphere) -> Gaussian:
-    """Moments in the memory's own chart, (..., Nx, 3) and (..., Nx, 6). Differentiable."""
+    """Moments in the memory's own coordinates, (..., Nx, 3) and (..., Nx, 6): a point, or a patch (g₁, g₂, ρ).
+
+    Differentiable.
+    """
     return gaussian_from_information(memory.information)
 
 
 def cartesian_belief(memory: EgoSphere, chart: str) -> Gaussian:
     """Moments in 3-D, in E: what information, exports and pictures use. Differentiable."""
     moments = belief(memory)
-    return moments if chart == "cartesian" else cartesian_from_inverse_range(moments, memory.cells)
+    return moments if chart == "cartesian" else cartesian_from_patches(moments, memory)
+
+
+def cartesian_from_patches(moments: Gaussian, memory: EgoSphere, far_m: float = 1000.0) -> Gaussian:
+    """Cartesian moments of the patches' points in their cells' directions, to first order.
+
+    Args:
+        moments: of the patches, from `belief`.
+        memory: whose.
+        far_m: an inverse range below 1/far_m is taken as 1/far_m.
+
+    Differentiable.
+    """
+    r = 1 / moments.mean[..., 2].clamp(min=1 / far_m)
+    across = r * r / memory.bearing
+    along = r**4 * moments.cov[..., 5] - across
+    x, y, z = memory.cells.unbind(-1)
+    mean = columns(r * x, r * y, r * z)
+    xx, yy, zz = across + along * x * x, across + along * y * y, across + along * z * z
+    return Gaussian(mean, columns(xx, along * x * y, along * x * z, yy, along * y * z, zz))

@@ -11,9 +11,8 @@ from torch import Tensor
 
 from torchfovea.acquisition import choose, upper_confidence_bound
 from torchfovea.camera import Camera, Pinhole
-from torchfovea.chart import cartesian_from_inverse_range
 from torchfovea.correspondence import Budget, Correspondences
-from torchfovea.egosphere import EgoSphere, Fusion, Prior, belief, new_egosphere, remember
+from torchfovea.egosphere import EgoSphere, Fusion, Prior, belief, cartesian_from_patches, new_egosphere, remember
 from torchfovea.gaussian import Gaussian
 from torchfovea.head import Eyes, Gaze, Head, fixate
 from torchfovea.layout import LogPolar, Retina
@@ -143,7 +142,7 @@ def perceive(
     observed = observe(
         matches, eyes, observer.camera, support, observer.points, observer.fusion.chart, observer.rotated
     )
-    memory = remember(mind.memory, mind.lookup, mind.spacing_rad, observed, observer.fusion, common)
+    memory = remember(mind.memory, mind.lookup, mind.spacing_rad, observed, observer.fusion, observer.prior, common)
     return mind._replace(memory=memory)
 
 
@@ -158,7 +157,7 @@ def reward_of(observer: Observer, mind: Mind) -> tuple[Gaussian, RewardBelief]:
         if observer.reward == "inverse_range":
             reward, unseen = inverse_range_from_range(reward), inverse_range_from_range(unseen)
     else:
-        points = cartesian_from_inverse_range(moments, mind.memory.cells)
+        points = cartesian_from_patches(moments, mind.memory)
         reward = RewardBelief(moments.mean[..., 2], moments.cov[..., 5].sqrt())
         unseen = RewardBelief(*(torch.tensor(v, dtype=points.mean.dtype) for v in (prior.mean, prior.std)))
         if observer.reward == "range":
