@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
@@ -26,7 +27,7 @@ _PARALLEL_FROM = 4000  # rays below which a second thread costs more than it sav
 _SKY = (0.62, 0.72, 0.82)
 _STEEPEST = np.float32(0.12)  # cosine of the slant at which the footprint stops growing
 _CUTOFF_M = 1e6  # surfaces beyond are misses
-_CHUNK = 8192  # pixels shaded at once: they stay in the cache
+_CHUNK = 40000  # pixels shaded at once: they stay in the cache
 
 
 class RayHits(NamedTuple):
@@ -60,8 +61,9 @@ class Frame(NamedTuple):
 
 
 @lru_cache(maxsize=1)
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(2, thread_name_prefix="torchfovea-rays")
+def _pool(process: int) -> ThreadPoolExecutor:
+    """One other thread, of this process: a fork takes no threads along."""
+    return ThreadPoolExecutor(1, thread_name_prefix="torchfovea-rays")
 
 
 def _cast_part(
@@ -92,7 +94,7 @@ def _in_parallel(n: int, work: Callable[[int], None]) -> None:
         work(0)
         work(1)
     else:
-        other = _pool().submit(work, 1)
+        other = _pool(os.getpid()).submit(work, 1)
         work(0)
         other.result()
 
@@ -181,6 +183,7 @@ def render(scene: Scene, R: Tensor, t: Tensor, camera: Camera, size_px: int) -> 
     turn = rotation @ R.detach().to("cpu", torch.float64).numpy()
     origin = rotation @ t.detach().to("cpu", torch.float64).numpy() + translation
     n = len(ray)
+    chunk = min(_CHUNK, -(-n // 2))
     image = np.empty((3, n), np.float32)
     distance = np.empty(n, np.float32)
     geom = np.empty(n, np.int64)
@@ -188,8 +191,8 @@ def render(scene: Scene, R: Tensor, t: Tensor, camera: Camera, size_px: int) -> 
     from_world, centre = rotation.astype(np.float32), origin.astype(np.float32)
 
     def work(worker: int) -> None:
-        for start in range(worker * _CHUNK, n, 2 * _CHUNK):
-            rows = slice(start, min(start + _CHUNK, n))
+        for start in range(worker * chunk, n, 2 * chunk):
+            rows = slice(start, min(start + chunk, n))
             direction = ray[rows] @ turn.T
             distance[rows], geom[rows], across64 = _cast_part(scene, worker, origin, direction)
             across, way = across64.astype(np.float32), direction.astype(np.float32)

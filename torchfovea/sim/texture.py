@@ -57,7 +57,8 @@ def _volume() -> torch.Tensor:
     bands = []
     for wavelength in (*_WAVELENGTHS, 24.0):
         noise = np.fft.rfftn(rng.standard_normal((_SIZE,) * 3))
-        band = np.fft.irfftn(noise * np.cos(math.pi / 2 * np.clip(octave + math.log2(wavelength), -1, 1)), (_SIZE,) * 3, axes=(0, 1, 2))
+        window = np.cos(math.pi / 2 * np.clip(octave + math.log2(wavelength), -1, 1))
+        band = np.fft.irfftn(noise * window, (_SIZE,) * 3, axes=(0, 1, 2))
         bands.append(band / band.std())
     # one voxel more on each far side closes the period for linear interpolation
     volume = np.pad(np.stack(bands), ((0, 0), (0, 1), (0, 1), (0, 1)), mode="wrap")
