@@ -1,0 +1,241 @@
+"""The numbers that are tuned: a flat vector, what mixture and exploration weight it stands for, and cells drawn from it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchfovea.head import Head, fixate
+from torchfovea.setting import require
+from torchfovea.sphere import DirectionMixture, Quadrature, _log_moment, _tail, fix_gauge
+
+__all__ = [
+    "Bias", "Shape", "decode", "draw_cells", "encode", "features", "fix_vector", "log_density_each", "log_normalizer_each",
+    "mixture_of", "reachable",
+]  # fmt: skip
+
+REACH_RANGE_M = 1.0  # as in `torchfovea.experiments.build`: a direction is reachable if its point at 1 m is
+_LOG_DIAGONAL = (-3.0, 1.0)
+_LOG_ALPHA = (-4.0, 4.0)
+_MEAN = 4.0
+_BLOCK = 8
+_FEWEST_ACCEPTED = 1e-3
+
+
+@dataclass(frozen=True)
+class Shape:
+    """How the vector is read.
+
+    Attributes:
+        components: M ≥ 1.
+        conditioned: whether the mixture depends on a task (B, 2) by quadratic regression: each of its numbers is a
+            polynomial of the task with six coefficients.
+        tune_alpha: whether log α is the last number of the vector; else α is `alpha`.
+        alpha: of a vector without it.
+    """
+
+    components: int = 1
+    conditioned: bool = False
+    tune_alpha: bool = True
+    alpha: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Raise SettingError for values out of range."""
+        good = isinstance(self.components, int) and 1 <= self.components <= 64
+        require(good, "components", self.components, "a whole number from 1 to 64")
+        require(math.exp(-4) <= self.alpha <= math.exp(4), "acquisition.alpha", self.alpha, "between 0.0183 and 54.6")
+
+    @property
+    def numbers(self) -> int:
+        """Of one mixture: means, log diagonals and lower triangles, and for M ≥ 2 the logits."""
+        return 9 * self.components + (self.components if self.components > 1 else 0)
+
+    @property
+    def size(self) -> int:
+        """Of the vector."""
+        return self.numbers * (6 if self.conditioned else 1) + int(self.tune_alpha)
+
+
+class Bias(NamedTuple):
+    """Mixtures, one for each scene or one for all (B = 1), and the exploration weight.
+
+    Attributes:
+        logits: (B, M).
+        means: (B, M, 3).
+        cholesky: (B, M, 3, 3).
+        alpha: scalar.
+    """
+
+    logits: Tensor
+    means: Tensor
+    cholesky: Tensor
+    alpha: Tensor
+
+
+def features(task: Tensor) -> Tensor:
+    """Monomials of a task up to second order, (B, 2) to (B, 6)."""
+    a, e = task.unbind(-1)
+    return torch.stack((torch.ones_like(a), a, e, a * a, a * e, e * e), -1)
+
+
+def decode(shape: Shape, vector: Tensor, task: Tensor) -> Bias:
+    """What a vector stands for.
+
+    Args:
+        shape: how to read it.
+        vector: (shape.size,).
+        task: (B, 2); only a conditioned shape looks at it.
+
+    Returns:
+        Mixtures with clamped log diagonals (−3 to 1), one for each scene if conditioned, else one. Differentiable.
+    """
+    body = vector[: shape.size - shape.tune_alpha]
+    raw = features(task) @ body.reshape(6, -1) if shape.conditioned else body[None]
+    m = shape.components
+    means = raw[:, : 3 * m].unflatten(1, (m, 3))
+    diagonal = raw[:, 3 * m : 6 * m].unflatten(1, (m, 3)).clamp(*_LOG_DIAGONAL).exp()
+    lower = raw[:, 6 * m : 9 * m].unflatten(1, (m, 3))
+    logits = raw[:, 9 * m :].clamp(-6, 6) if m > 1 else torch.zeros_like(raw[:, :1])
+    zero = torch.zeros_like(lower[..., 0])
+    rows = (
+        (diagonal[..., 0], zero, zero),
+        (lower[..., 0], diagonal[..., 1], zero),
+        (lower[..., 1], lower[..., 2], diagonal[..., 2]),
+    )
+    cholesky = torch.stack([torch.stack(row, -1) for row in rows], -2)
+    log_alpha = vector[-1].clamp(*_LOG_ALPHA) if shape.tune_alpha else vector.new_tensor(math.log(shape.alpha))
+    return Bias(logits, means, cholesky, log_alpha.exp())
+
+
+def encode(shape: Shape, mixture: DirectionMixture, alpha: float) -> Tensor:
+    """The vector of one mixture and α, of a gauge in which E|v|² = 1.
+
+    A mixture of fewer components than the shape is repeated, with its means a little apart to break the symmetry.
+    A conditioned shape starts from the mixture for every task.
+
+    Raises:
+        SettingError: for a mixture with more components than the shape, or an α without a logarithm within ±4.
+    """
+    given, m = len(mixture.means), shape.components
+    require(given <= m, "components", m, f"at least the {given} of the start")
+    require(alpha > 0 and abs(math.log(alpha)) <= 4, "acquisition.alpha", alpha, "between 0.0183 and 54.6 at the start")
+    mixture = fix_gauge(DirectionMixture(*(t.double() for t in mixture)))
+    which = torch.arange(m) % given
+    apart = torch.randn(m, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * (0.3 if m > given else 0)
+    means = mixture.means[which] + apart * (torch.arange(m) >= given)[:, None]
+    factor = mixture.cholesky[which]
+    diagonal = factor.diagonal(dim1=-2, dim2=-1).log().clamp(*_LOG_DIAGONAL)
+    lower = torch.stack((factor[:, 1, 0], factor[:, 2, 0], factor[:, 2, 1]), -1)
+    parts = [means.flatten(), diagonal.flatten(), lower.flatten()]
+    if m > 1:
+        parts.append(mixture.logits[which])
+    body = torch.cat(parts)
+    if shape.conditioned:
+        body = torch.cat((body, torch.zeros(5 * len(body), dtype=torch.float64)))
+    tail = [torch.tensor([math.log(alpha)], dtype=torch.float64)] if shape.tune_alpha else []
+    return torch.cat([body, *tail])
+
+
+def fix_vector(shape: Shape, vector: Tensor) -> Tensor:
+    """The same policy in a fixed gauge and within the limits; an optimizer calls it after each step.
+
+    A conditioned vector has no gauge of its own for each task: it is only clamped.
+    """
+    vector = vector.clone()
+    if shape.tune_alpha:
+        vector[-1] = vector[-1].clamp(*_LOG_ALPHA)
+    if shape.conditioned:
+        return vector.clamp(-_MEAN, _MEAN)
+    bias = decode(shape, vector, vector.new_zeros(1, 2))
+    mixture = DirectionMixture(bias.logits[0], bias.means[0], bias.cholesky[0])
+    return encode(shape, mixture, float(bias.alpha)).to(vector)
+
+
+def mixture_of(shape: Shape, vector: Tensor, task: Tensor | None = None) -> DirectionMixture:
+    """The mixture of a vector, for one task (2,) if it is conditioned."""
+    bias = decode(shape, vector, torch.zeros(1, 2).to(vector) if task is None else task[None].to(vector))
+    return fix_gauge(DirectionMixture(bias.logits[0], bias.means[0], bias.cholesky[0]))
+
+
+def reachable(head: Head, directions: Tensor) -> Tensor:
+    """Whether the head can fixate points at 1 m in these directions, (..., 3) to bool (...)."""
+    return fixate(head, REACH_RANGE_M * directions)[1]
+
+
+def draw_cells(bias: Bias, scenes: int, cells: int, head: Head, generator: torch.Generator) -> Tensor:
+    """Draw every scene's cells within reach (B, N, 3), slot by slot.
+
+    Every slot has its own sequence of random numbers and takes its first reachable draw, so that a slightly different
+    bias gives slightly different cells.
+
+    Raises:
+        SettingError: where fewer than one draw in a thousand is reachable.
+    """
+    dtype = bias.means.dtype
+    logits, means, factor = (
+        t.detach().expand(scenes, *t.shape[1:]) for t in (bias.logits, bias.means, bias.cholesky)
+    )
+    edges = logits.softmax(-1).cumsum(-1)
+    direction = torch.zeros(scenes, cells, 3, dtype=dtype)
+    waiting = torch.arange(scenes * cells)
+    tried = 0
+    m = logits.shape[-1]
+    while len(waiting):
+        draws = torch.randn(_BLOCK, scenes * cells, 3, generator=generator)[:, waiting].to(dtype)
+        lot = torch.rand(_BLOCK, scenes * cells, generator=generator)[:, waiting].to(dtype)
+        scene = waiting // cells
+        component = (lot[..., None] > edges[scene]).sum(-1).clamp(max=m - 1)
+        v = means[scene, component] + (factor[scene, component] @ draws[..., None])[..., 0]
+        unit = torch.nn.functional.normalize(v, dim=-1)
+        good = reachable(head, unit)
+        tried += _BLOCK
+        first = good.to(torch.uint8).argmax(0)
+        any_good = good.any(0)
+        chosen = unit.gather(0, first[None, :, None].expand(1, -1, 3))[0]
+        direction.view(-1, 3)[waiting[any_good]] = chosen[any_good]
+        waiting = waiting[~any_good]
+        filled = 1 - len(waiting) / (scenes * cells)
+        # a share s of reachable draws would have filled 1 − (1 − s)^tried by now
+        enough = tried < 512 or filled > 1 - (1 - _FEWEST_ACCEPTED) ** tried
+        require(
+            enough and tried < 16 / _FEWEST_ACCEPTED,
+            "reachable",
+            f"{filled:.1%} of the cells after {tried} draws each",
+            "at least one draw in a thousand within the head's reach: the bias and the reachable set do not overlap",
+        )
+    return direction
+
+
+def log_density_each(bias: Bias, directions: Tensor) -> Tensor:
+    """`torchfovea.sphere.log_density` of a batch of mixtures, each at its own directions.
+
+    Args:
+        bias: B mixtures (or one for all).
+        directions: unit (B, K, 3).
+
+    Returns:
+        (B, K), per steradian. Differentiable in the mixtures.
+    """
+    u = directions.unsqueeze(-2)
+    eye = torch.eye(3, dtype=u.dtype, device=u.device)
+    whitening = torch.linalg.solve_triangular(bias.cholesky, eye.expand_as(bias.cholesky), upper=False)
+    w = torch.einsum("bmij,bkj->bkmi", whitening.expand(len(directions), -1, -1, -1), directions)
+    y = (whitening @ bias.means[..., None])[..., 0][:, None]
+    length = w.square().sum(-1).sqrt()
+    w = w / length[..., None]
+    d = (w * y).sum(-1)
+    off_axis = torch.linalg.cross(w, y.expand_as(w)).square().sum(-1)
+    radial = _log_moment(d) - 0.5 * torch.where(d > -_tail(d.dtype)[0], off_axis, y.square().sum(-1))
+    log_det = bias.cholesky.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    weight = (bias.logits.log_softmax(-1) - math.log(2 * math.pi) - log_det)[:, None]
+    return torch.logsumexp(weight - 3 * length.log() + radial, -1)
+
+
+def log_normalizer_each(bias: Bias, quadrature: Quadrature) -> Tensor:
+    """Log probability of the reachable set under each mixture, (B,). Differentiable."""
+    directions = quadrature.directions.to(bias.means).expand(len(bias.means), -1, -1)
+    return torch.logsumexp(log_density_each(bias, directions) + quadrature.solid_angle_sr.to(bias.means).log(), -1)

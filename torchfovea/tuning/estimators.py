@@ -1,0 +1,212 @@
+"""Estimators of the gradient of the expected gap per saccade with respect to the tuned vector.
+
+A gradient credits directions: Σ_j w_j ∇ log p̃(u_j), with p̃ the cells' density restricted to the reachable set. Cells are
+drawn independently, so that E[∇ log p̃(p_i) f] = 0 for any f that does not look at cell i.
+
+- `counterfactual`: w_i = R(P) − R(P∖p_i) for every fixated cell. *Unbiased* for the hard argmax policy, for removing a cell
+  changes no other cell's observations here, and a cell that is never fixated has w_i = 0 exactly. Each fixated cell costs a
+  run from its first fixation on.
+- `covered`: the same with an analytic control variate. Let f(P) be the value of the best can that any cell falls on. Its
+  expectation over cells, F = Σ_c v_c [(1 − m_1 − … − m_{c−1})^N − (1 − m_1 − … − m_c)^N] with m_c = ∫_can p̃, has an exact
+  gradient without any luck of the draw, and f has counterfactuals without any run, so that ∇F plus the counterfactual of
+  R − f is unbiased too (but for the quadrature of m).
+- `coverage`: ∇F alone: no run at all. Biased, for F knows cells but no saccades; a warm start.
+
+α is not in p̃: its derivative is a central difference of log α with common random numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchfovea.metrics import gap
+from torchfovea.tuning.bias import Bias, log_density_each, log_normalizer_each
+from torchfovea.tuning.problem import Batch, Problem, prepare
+from torchfovea.tuning.scenes import Scenes, cast, nearest_point
+from torchfovea.tuning.simulator import Memory, Run, World, blank, simulate
+
+__all__ = ["Credit", "Gradient", "alpha_difference", "counterfactual", "coverage", "covered", "finish", "pull"]
+
+_ALPHA_STEP = 0.25  # of log α, to either side
+
+
+class Gradient(NamedTuple):
+    """An estimate.
+
+    Attributes:
+        vector: ascent direction, the size of the tuned vector, float64.
+        value: the objective on this batch.
+        episodes: simulated episodes spent, in saccades of N cells over T.
+        runs: simulated runs begun, each counted whole.
+    """
+
+    vector: Tensor
+    value: float
+    episodes: float
+    runs: int
+
+
+class Credit(NamedTuple):
+    """Directions (J, 3) in scenes (J,) and their weights (J,)."""
+
+    scene: Tensor
+    direction: Tensor
+    weight: Tensor
+
+
+def pull(problem: Problem, vector: Tensor, batch: Batch, credits: list[Credit]) -> Tensor:
+    """Σ_j w_j ∇ log p̃(u_j), averaged over the batch's scenes."""
+    n = len(batch.scenes.nearest_m)
+    x = vector.detach().to(problem.dtype).requires_grad_()
+    bias = problem.bias(x, batch.scenes)
+    shared = len(bias.means) == 1
+    total = torch.zeros((), dtype=problem.dtype)
+    per_scene = torch.zeros(n, dtype=problem.dtype)
+    for scene, direction, weight in credits:
+        if shared:
+            density = log_density_each(bias, direction[None])[0]
+        else:
+            each = Bias(bias.logits[scene], bias.means[scene], bias.cholesky[scene], bias.alpha)
+            density = log_density_each(each, direction[:, None])[:, 0]
+        total = total + (weight * density).sum()
+        per_scene = per_scene.index_add(0, scene, weight)
+    normalizer = log_normalizer_each(bias, problem.quadrature)
+    total = total - (per_scene * normalizer).sum()
+    return torch.autograd.grad(total / n, x)[0].double()
+
+
+def alpha_difference(problem: Problem, vector: Tensor, batch: Batch, world: World, share: float = 1.0) -> tuple[float, float]:
+    """d J/d log α by a central difference on the same cells, scenes and noise; and the episodes spent."""
+    if not problem.shape.tune_alpha or share <= 0:
+        return 0.0, 0.0
+    n = max(1, round(share * len(batch.scenes.nearest_m)))
+    part = torch.arange(n)
+    scenes, world = batch.scenes.take(part), world.take(part)
+    alpha = problem.bias(vector.detach(), batch.scenes).alpha
+    high, low = (
+        simulate(problem.task, scenes, world, alpha * math.exp(h)).value.mean() for h in (_ALPHA_STEP, -_ALPHA_STEP)
+    )
+    return float((high - low) / (2 * _ALPHA_STEP)), 2.0 * n
+
+
+def finish(
+    problem: Problem, vector: Tensor, batch: Batch, world: World, credits: list[Credit], value: Tensor, episodes: float,
+    runs: int, alpha_share: float,
+) -> Gradient:  # fmt: skip
+    gradient = pull(problem, vector, batch, credits)
+    slope, spent = alpha_difference(problem, vector, batch, world, alpha_share)
+    if problem.shape.tune_alpha:
+        gradient[-1] = slope
+    return Gradient(gradient, float(value.mean()), episodes + spent, runs + round(spent))
+
+
+def counterfactual(problem: Problem, vector: Tensor, batch: Batch, alpha_share: float = 0.25) -> Gradient:
+    """Leave one fixated cell out: unbiased for the hard policy; runs restart at the cell's first fixation."""
+    bias = problem.bias(vector.detach(), batch.scenes)
+    world, run, credit, spent = _removals(problem, bias, batch)
+    n = len(batch.scenes.nearest_m)
+    runs = n + len(credit.scene)
+    return finish(problem, vector, batch, world, [credit], run.value, n + spent, runs, alpha_share)
+
+
+def _removals(problem: Problem, bias: Bias, batch: Batch) -> tuple[World, Run, Credit, float]:
+    """Episodes, and what each fixated cell was worth; with the episodes that this took besides."""
+    task, n = problem.task, len(batch.scenes.nearest_m)
+    world = prepare(problem, bias, batch)
+    run = simulate(task, batch.scenes, world, bias.alpha, keep=True)
+    first = torch.full((n, problem.cells + 1), task.saccades)
+    times = torch.arange(task.saccades).expand(n, -1)
+    # a cell of −1 counts as a last one, dropped
+    first = first.scatter_reduce(1, run.cell % (problem.cells + 1), times, "amin")[:, :-1]
+    scene, cell = (first < task.saccades).nonzero(as_tuple=True)
+    made = first[scene, cell] - 1
+    memory = Memory(*(torch.stack(parts)[made, scene] for parts in zip(*run.memories, strict=True)))
+    without = world.take(scene)
+    without.allowed[torch.arange(len(scene)), cell] = False
+    other = simulate(task, batch.scenes.take(scene), without, bias.alpha, (memory, made, run.reward[scene]))
+    weight = run.value[scene] - other.value
+    spent = float((task.saccades - 1 - made).sum()) / (task.saccades - 1)
+    return world, run, Credit(scene, world.direction[scene, cell], weight), spent
+
+
+def coverage(problem: Problem, vector: Tensor, batch: Batch, alpha_share: float = 0.0) -> Gradient:
+    """Gradient of the probability-weighted value of the best can that a cell falls on; plays only what α needs.
+
+    A scene counts as an episode though none is played.
+    """
+    n = len(batch.scenes.nearest_m)
+    value = _values(problem, batch.scenes)
+    gradient, total = _coverage(problem, vector, batch.scenes, value)
+    if problem.shape.tune_alpha and alpha_share > 0:
+        world = prepare(problem, problem.bias(vector.detach(), batch.scenes), batch)
+        gradient[-1], spent = alpha_difference(problem, vector, batch, world, alpha_share)
+        return Gradient(gradient, total, n + spent, n + round(spent))
+    return Gradient(gradient, total, n, n)
+
+
+def covered(problem: Problem, vector: Tensor, batch: Batch, alpha_share: float = 0.25) -> Gradient:
+    """`counterfactual` with coverage as control variate."""
+    bias = problem.bias(vector.detach(), batch.scenes)
+    world, run, credit, spent = _removals(problem, bias, batch)
+    value = _values(problem, batch.scenes)
+    # f(P) − f(P∖p_i) is not zero only for the one cell on the best can that is covered
+    on = cast(batch.scenes, torch.zeros_like(world.direction[:, :1]), world.direction).can
+    worth = torch.cat((value, torch.zeros_like(value[:, :1])), 1).gather(1, on % (value.shape[1] + 1))
+    (best, second), which = worth.topk(2, 1).values.unbind(1), worth.argmax(1)
+    n = len(value)
+    scene = torch.arange(n)
+    luck = Credit(scene, world.direction[scene, which], second - best)
+    gradient = finish(
+        problem, vector, batch, world, [credit, luck], run.value, n + spent, n + len(credit.scene), alpha_share
+    )
+    slope, _ = _coverage(problem, vector, batch.scenes, value)
+    return gradient._replace(vector=gradient.vector + slope)
+
+
+def _values(problem: Problem, scenes: Scenes) -> Tensor:
+    """What finding each can is worth, (B, S): its gap, for all saccades but two."""
+    steps = problem.task.saccades
+    first = blank(problem.task, scenes)[1][:, None]
+    reach = nearest_point(*(f for f in scenes[:5])).norm(dim=-1)
+    room = (-scenes.nearest_m[:, None] - first).clamp(min=1e-6)
+    lasting = 1.0 if problem.task.metric == "gap_final" else max(steps - 2, 1) / steps
+    return ((-reach - first) / room).clamp(0, 1) * lasting
+
+
+def _coverage(problem: Problem, vector: Tensor, scenes: Scenes, value: Tensor) -> tuple[Tensor, float]:
+    """∇F and F, averaged over scenes."""
+    x = vector.detach().to(problem.dtype).requires_grad_()
+    bias = problem.bias(x, scenes)
+    direction, solid, can = _on_cans(scenes)
+    density = log_density_each(bias, direction) - log_normalizer_each(bias, problem.quadrature)[:, None]
+    mass = torch.zeros_like(value).scatter_add(1, can.clamp(min=0), density.exp() * solid * (can >= 0))
+    order = value.argsort(1, descending=True)
+    missed = (1 - mass.gather(1, order).cumsum(1)).clamp(0, 1)
+    missed = torch.cat((torch.ones_like(missed[:, :1]), missed), 1) ** problem.cells
+    total = (value.gather(1, order) * (missed[:, :-1] - missed[:, 1:])).sum(1).mean()
+    return torch.autograd.grad(total, x)[0].double(), float(total.detach())
+
+
+def _on_cans(scenes: Scenes, columns: int = 6, rows: int = 9) -> tuple[Tensor, Tensor, Tensor]:
+    """Directions (B, K, 3) that tile every can's box of azimuth and height, their solid angles, and the can seen (or −1)."""
+    away = torch.hypot(scenes.x, scenes.y)
+    azimuth = torch.atan2(scenes.y, scenes.x)
+    half = torch.asin((scenes.radius / away).clamp(max=0.99))
+    near, far = away - scenes.radius, away + scenes.radius
+    low = torch.minimum(scenes.low / near, scenes.low / far).atan().sin()
+    high = torch.maximum(scenes.high / near, scenes.high / far).atan().sin()
+    u = ((torch.arange(columns) + 0.5) / columns).to(away)
+    v = ((torch.arange(rows) + 0.5) / rows).to(away)
+    a = azimuth[..., None, None] + half[..., None, None] * (2 * u[:, None] - 1)
+    z = low[..., None, None] + (high - low)[..., None, None] * v
+    a, z = torch.broadcast_tensors(a, z)
+    flat = (1 - z * z).sqrt()
+    direction = torch.stack((flat * a.cos(), flat * a.sin(), z), -1).flatten(1, 3)
+    solid = (2 * half * (high - low) / (columns * rows))[..., None].expand(*away.shape, columns * rows).flatten(1)
+    seen = cast(scenes, torch.zeros_like(direction[:, :1]), direction).can
+    own = torch.arange(away.shape[1]).repeat_interleave(columns * rows)
+    return direction, solid, torch.where(seen == own, seen, torch.full_like(seen, -1))

@@ -1,0 +1,102 @@
+"""A tuning problem: episodes on a scene distribution as a function of a vector, with common random numbers."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchfovea.setting import require
+from torchfovea.sphere import Quadrature, sphere_quadrature
+from torchfovea.tuning.bias import Bias, Shape, decode, draw_cells, reachable
+from torchfovea.tuning.prior_field import PriorField, look_up
+from torchfovea.tuning.scenes import Distribution, Scenes, draw_scenes
+from torchfovea.tuning.simulator import Run, Task, World, check_observer, simulate, world_of
+
+__all__ = ["Batch", "Problem", "evaluate", "play", "prepare"]
+
+_QUADRATURE = 12000  # directions on the whole sphere
+
+
+class Batch(NamedTuple):
+    """Random inputs of B episodes.
+
+    Attributes:
+        scenes: B of them.
+        noise: (T, B, N).
+        seed: of the cells.
+    """
+
+    scenes: Scenes
+    noise: Tensor
+    seed: int
+
+
+class Problem:
+    """What is tuned, on what.
+
+    Args:
+        task: what an episode is.
+        distribution: of scenes.
+        shape: how a vector is read.
+        cells: N, of each episode's memory.
+        dtype: of the episodes.
+        field: what cells believe before they are seen; None: the observer's prior.
+
+    Raises:
+        SettingError: for no cells, fewer than two saccades, or an observer that the simulator does not model.
+    """
+
+    def __init__(
+        self, task: Task, distribution: Distribution, shape: Shape, cells: int = 100,
+        dtype: torch.dtype = torch.float32, field: PriorField | None = None,
+    ) -> None:  # fmt: skip
+        require(cells >= 2, "memory.cells", cells, "at least 2")
+        names = ("gap_per_saccade", "gap_final")
+        require(task.metric in names, "metric", task.metric, "one of " + ", ".join(names))
+        require(task.saccades >= 2, "saccades", task.saccades, "at least 2")
+        check_observer(task.observer)
+        self.task, self.distribution, self.shape, self.cells, self.dtype = task, distribution, shape, cells, dtype
+        self.field = field
+
+    @cached_property
+    def quadrature(self) -> Quadrature:
+        """Directions within reach, for normalizers."""
+        return sphere_quadrature(_QUADRATURE, lambda d: reachable(self.task.observer.head, d), self.dtype)
+
+    def batch(self, scenes: int, generator: torch.Generator) -> Batch:
+        """Draw the random inputs of some episodes."""
+        drawn = draw_scenes(self.distribution, self.task.observer.head, scenes, generator, self.dtype)
+        noise = torch.randn(self.task.saccades, scenes, self.cells, generator=generator, dtype=self.dtype)
+        return Batch(drawn, noise, int(torch.randint(2**62, (), generator=generator)))
+
+    def bias(self, vector: Tensor, scenes: Scenes) -> Bias:
+        """The vector's mixtures for some scenes. Differentiable in the vector."""
+        return decode(self.shape, vector.to(self.dtype), scenes.task)
+
+
+def prepare(problem: Problem, bias: Bias, batch: Batch) -> World:
+    """Draw the cells of a batch and put them into its scenes."""
+    n = len(batch.scenes.nearest_m)
+    cells = draw_cells(bias, n, problem.cells, problem.task.observer.head, torch.Generator().manual_seed(batch.seed))
+    world = world_of(problem.task, batch.scenes, cells, batch.noise)
+    if problem.field is not None:
+        mean, std = look_up(problem.field, cells)
+        world = world._replace(prior_mean=mean, prior_precision=std**-2)
+    return world
+
+
+def play(problem: Problem, vector: Tensor, batch: Batch) -> Run:
+    """The episodes of a batch with the hard policy; the same batch gives the same episodes."""
+    bias = problem.bias(vector.detach(), batch.scenes)
+    return simulate(problem.task, batch.scenes, prepare(problem, bias, batch), bias.alpha)
+
+
+def evaluate(problem: Problem, vector: Tensor, scenes: int, generator: torch.Generator, at_once: int = 256) -> Tensor:
+    """The metric in fresh episodes, (scenes,), with the hard policy."""
+    parts = []
+    for begin in range(0, scenes, at_once):
+        parts.append(play(problem, vector, problem.batch(min(at_once, scenes - begin), generator)).value)
+    return torch.cat(parts)

@@ -1,0 +1,312 @@
+"""A fast, batched, cell-centric simulator of visual search, with the hard policy.
+
+In a saccade each cell that both retinas see gets *one* noisy inverse range, measured on its own direction, and keeps a
+scalar Gaussian belief of it. Removing or adding a cell changes no other cell's observations, which is what makes the
+counterfactual gradient exact here. Against the full simulator there is no occlusion between the eyes, no poles and no
+furniture, no pooling of receptive fields and no patch scatter; the standard deviation of an observation is that of
+`torchfovea.triangulation.observe` to first order.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchfovea.acquisition import upper_confidence_bound
+from torchfovea.camera import Pinhole
+from torchfovea.correspondence import eye_sigma_px
+from torchfovea.gaussian import columns
+from torchfovea.head import Eyes, Gaze, cyclopean, eyes, fixate
+from torchfovea.metrics import gap
+from torchfovea.perception import Observer
+from torchfovea.reward import RewardBelief, range_from_inverse_range
+from torchfovea.setting import require
+from torchfovea.tuning.scenes import Scenes, cast
+
+__all__ = [
+    "Memory", "Run", "Task", "World", "best_cell", "blank", "check_observer", "empty", "glance", "look", "score", "simulate",
+    "true_reward", "world_of", "worth",
+]  # fmt: skip
+
+_FAR_M = 1000.0
+
+
+class Task(NamedTuple):
+    """What an episode is made of besides the cells.
+
+    Attributes:
+        observer: the fixed parts; its acquisition is not used.
+        saccades: T, the initial gaze included.
+        far_m: what a fixation on the floor counts as.
+        metric: what an episode is worth: gap_per_saccade or gap_final.
+    """
+
+    observer: Observer
+    saccades: int = 10
+    far_m: float = 6.0
+    metric: str = "gap_per_saccade"
+
+
+class World(NamedTuple):
+    """Cells in their scenes.
+
+    Attributes:
+        direction: unit (B, N, 3).
+        range_m: true range from E, (B, N).
+        noise: standard normal draws of every cell's observation in every saccade, (T, B, N).
+        allowed: cells that exist, bool (B, N); the others are never fixated.
+        prior_mean: inverse range believed before the cell is seen, (B, N) [1/m].
+        prior_precision: (B, N) [m²].
+    """
+
+    direction: Tensor
+    range_m: Tensor
+    noise: Tensor
+    allowed: Tensor
+    prior_mean: Tensor
+    prior_precision: Tensor
+
+    def take(self, index: Tensor) -> World:
+        """The episodes of an index (K,), copied."""
+        d, r, n, a, m, p = self
+        return World(d[index], r[index], n[:, index], a[index], m[index], p[index])
+
+
+class Memory(NamedTuple):
+    """Scalar information filters of inverse range.
+
+    Attributes:
+        precision: (B, N).
+        vector: precision times mean, (B, N).
+        seen: bool (B, N).
+    """
+
+    precision: Tensor
+    vector: Tensor
+    seen: Tensor
+
+
+class Run(NamedTuple):
+    """What happened in B episodes.
+
+    Attributes:
+        value: the task's metric, (B,).
+        reward: true, (B, T).
+        cell: chosen for the fixation at t, (B, T); −1 for the initial gaze and where none was eligible.
+        score: of the chosen cell, (B, T); −inf where there is none.
+        gaze: executed, angles (B, T).
+        memories: before each decision, T − 1 of them; empty unless asked for.
+    """
+
+    value: Tensor
+    reward: Tensor
+    cell: Tensor
+    score: Tensor
+    gaze: Gaze
+    memories: list[Memory]
+
+
+def check_observer(observer: Observer) -> None:
+    """Raise SettingError for an observer that this simulator does not model."""
+    pinhole = isinstance(observer.camera, Pinhole)
+    require(pinhole, "sensor.camera", type(observer.camera).__name__, "pinhole, in tuning")
+    require(observer.fusion.chart == "inverse_range", "fusion", observer.fusion.name, "inverse_range, in tuning")
+
+
+def empty(world: World) -> Memory:
+    """Nothing seen yet."""
+    none = torch.zeros_like(world.allowed)
+    return Memory(world.prior_precision, world.prior_precision * world.prior_mean, none)
+
+
+def world_of(task: Task, scenes: Scenes, cells: Tensor, noise: Tensor) -> World:
+    """Put cells (B, N, 3) into B scenes, with noise (T, B, N)."""
+    hits = cast(scenes, torch.zeros_like(cells[:, :1]), cells)
+    prior = task.observer.prior
+    mean = torch.full_like(hits.range_m, prior.mean)
+    precision = torch.full_like(mean, prior.std**-2)
+    return World(cells, hits.range_m, noise, torch.ones_like(hits.floor), mean, precision)
+
+
+def glance(observer: Observer, pose: Eyes, point: Tensor, direction: Tensor, range_m: Tensor) -> tuple[Tensor, Tensor]:
+    """Which points both retinas see, and the variance of their inverse range, to first order.
+
+    An error ε of one eye's ray inside the epipolar plane moves the point along the other eye's ray by ε s/sin δ, with s its
+    distance from the erring eye and δ the angle between the rays; the range from E changes by that times the cosine
+    between the unmoved ray and the cell's direction.
+
+    Args:
+        observer: camera, retina and error budget.
+        pose: of the eyes, (B, ...).
+        point: (B, N, 3) in E [m].
+        direction: of the points from E, unit (B, N, 3).
+        range_m: (B, N).
+
+    Returns:
+        bool (B, N) and (B, N) [1/m²], finite everywhere. Differentiable.
+    """
+    focal, retina = observer.camera.focal_px, observer.retina
+    left, right = point - pose.t_left.unsqueeze(-2), point - pose.t_right.unsqueeze(-2)
+    bx, by, bz = (pose.t_right - pose.t_left).unsqueeze(-2).unbind(-1)
+    lx, ly, lz = left.unbind(-1)
+    nx, ny, nz = by * lz - bz * ly, bz * lx - bx * lz, bx * ly - by * lx
+    area_square = (nx * nx + ny * ny + nz * nz).clamp(min=1e-12)
+    visible = torch.ones_like(range_m, dtype=torch.bool)
+    sides = []
+    for rotation, ray in ((pose.R_left, left), (pose.R_right, right)):
+        x, y, z = (ray @ rotation).unbind(-1)
+        square = (ray * ray).sum(-1).clamp(min=1e-8)
+        ahead = z > 1e-3
+        depth = torch.where(ahead, z, torch.ones_like(z))
+        px = focal * columns(x / depth, y / depth)
+        visible = visible & ahead & retina.inside(px)
+        sigma = eye_sigma_px(observer.budget, retina, px)
+        # the error's direction in the image: q = m × d for the plane's normal m and the ray d; 1 − q_z² shortens it
+        ax, ay, az = rotation[..., 2].unsqueeze(-2).unbind(-1)
+        dx, dy, dz = ray.unbind(-1)
+        q = nx * (dy * az - dz * ay) + ny * (dz * ax - dx * az) + nz * (dx * ay - dy * ax)
+        lateral = (1 - q * q / (area_square * square)).clamp(min=0)
+        error = (sigma * depth / focal).square() / square * lateral
+        sides.append((error, square, (direction * ray).sum(-1)))
+    (error_l, square_l, along_l), (error_r, square_r, along_r) = sides
+    # s_l s_r/|b × d_l s_l| = 1/sin δ; along = s cos
+    spread = error_r * square_r * square_r * along_l.square() + error_l * square_l * square_l * along_r.square()
+    inverse = 1 / range_m
+    return visible, (spread / area_square * inverse.square().square()).clamp(min=1e-12)
+
+
+def look(task: Task, world: World, memory: Memory, pose: Eyes, t: int) -> Memory:
+    """Fuse one saccade's observations into the memory."""
+    point = world.direction * world.range_m[..., None]
+    visible, variance = glance(task.observer, pose, point, world.direction, world.range_m)
+    weight = visible / variance
+    measured = 1 / world.range_m + variance.sqrt() * world.noise[t]
+    return Memory(memory.precision + weight, memory.vector + weight * measured, memory.seen | visible)
+
+
+def score(task: Task, world: World, memory: Memory, alpha: Tensor) -> tuple[Tensor, Tensor]:
+    """Upper confidence bound of every cell.
+
+    Args:
+        task: with the reward's kind.
+        world: the cells.
+        memory: their beliefs.
+        alpha: (B,) or a scalar.
+
+    Returns:
+        Scores (B, N), −inf where not eligible, and the believed points (B, N, 3).
+    """
+    observer = task.observer
+    mean, std = memory.vector / memory.precision, memory.precision.rsqrt()
+    reward = RewardBelief(mean, std)
+    if observer.reward == "range":
+        reward = range_from_inverse_range(reward)
+    range_m = 1 / mean.clamp(min=1 / _FAR_M)
+    point = world.direction * range_m[..., None]
+    reachable = fixate(observer.head, point)[1]
+    limits = observer.eligibility
+    ground = memory.seen & (point[..., 2] + observer.head.ego_height_m < limits.ground_z_m)
+    eligible = world.allowed & reachable & (range_m > limits.nearest_m) & ~ground
+    value = upper_confidence_bound(reward.mean, reward.std, alpha.to(mean).expand(mean.shape[:1]))
+    return torch.where(eligible, value, torch.full_like(value, -math.inf)), point
+
+
+def best_cell(value: Tensor) -> tuple[Tensor, Tensor]:
+    """The best score and its cell; among equals the first: cells are drawn alike, so that this is a fair lot."""
+    best, cell = value.max(-1)
+    return best, torch.where(torch.isfinite(best), cell, torch.full_like(cell, -1))
+
+
+def true_reward(task: Task, scenes: Scenes, gaze: Gaze) -> Tensor:
+    """−range of the first surface on the cyclopean ray (from E's origin, as the metrics have it), −far_m for floor."""
+    rotation, origin = cyclopean(task.observer.head, gaze)
+    axis = rotation[..., 2]
+    hits = cast(scenes, origin[:, None], axis[:, None])
+    point = origin + hits.range_m * axis
+    return -torch.where(hits.floor[:, 0], torch.full_like(point[:, 0], task.far_m), point.norm(dim=-1)).clamp(
+        max=task.far_m
+    )
+
+
+def blank(task: Task, scenes: Scenes) -> tuple[Gaze, Tensor]:
+    """The initial gaze, straight ahead (B,), and its reward."""
+    zero = torch.zeros_like(scenes.nearest_m)
+    gaze = Gaze(zero, zero, zero)
+    return gaze, true_reward(task, scenes, gaze)
+
+
+def worth(task: Task, reward: Tensor, nearest_m: Tensor) -> Tensor:
+    """The task's metric of rewards (..., T) in scenes whose nearest point is at nearest_m (...)."""
+    course = gap(reward, -nearest_m)
+    return course[..., -1] if task.metric == "gap_final" else course.mean(-1)
+
+
+def simulate(
+    task: Task,
+    scenes: Scenes,
+    world: World,
+    alpha: Tensor,
+    start: tuple[Memory, Tensor, Tensor] | None = None,
+    keep: bool = False,
+) -> Run:
+    """Run B episodes with the hard policy.
+
+    Args:
+        task: what an episode is.
+        scenes: B of them.
+        world: their cells.
+        alpha: exploration, (B,) or a scalar.
+        start: to begin at a decision: memory before it, (B, N); decisions already made t ≥ 0, (B,) int64; rewards so far
+            (B, T), of which the first t + 1 count. Runs later in their episode wait for the others.
+        keep: keep the memories before each decision.
+
+    Same arguments, same episodes. Not differentiable: the policy is an argmax.
+    """
+    n, steps = len(scenes.nearest_m), task.saccades
+    gaze, first = blank(task, scenes)
+    reward = first[:, None].repeat(1, steps)
+    cells = torch.full((n, steps), -1)
+    scores = torch.full_like(reward, -math.inf)
+    gazes = [gaze]
+    memories: list[Memory] = []
+    if start is None:
+        memory = look(task, world, empty(world), eyes(task.observer.head, gaze), 0)
+        made = torch.zeros(n, dtype=torch.long)
+    else:
+        memory, made, reward = start
+        reward = reward.clone()
+        require(not keep, "keep", keep, "False for runs that begin later")
+        order = made.argsort(stable=True)
+        memory, world, scenes = Memory(*(m[order] for m in memory)), world.take(order), scenes.take(order)
+        reward, alpha, made = reward[order], alpha.expand(n)[order], made[order]
+    for t in range(steps - 1):
+        live = n if start is None else int((made <= t).sum())
+        if live == 0:
+            gazes.append(gaze)
+            continue
+        part = slice(0, live)
+        w = world if live == n else World(*(f[:, part] if i == 2 else f[part] for i, f in enumerate(world)))
+        m = memory if live == n else Memory(*(f[part] for f in memory))
+        s = scenes if live == n else scenes.take(torch.arange(live))
+        if keep:
+            memories.append(m)
+        value, point = score(task, w, m, alpha.expand(n)[part])
+        best, cell = best_cell(value)
+        chosen = point.gather(1, cell.clamp(min=0)[:, None, None].expand(-1, 1, 3))[:, 0]
+        ahead = (cell >= 0).to(best.dtype)
+        now = Gaze(*(angle * ahead for angle in fixate(task.observer.head, chosen)[0]))
+        reward[part, t + 1] = true_reward(task, s, now)
+        cells[part, t + 1], scores[part, t + 1] = cell, best
+        gazes.append(now)
+        if t + 2 < steps:
+            m = look(task, w, m, eyes(task.observer.head, now), t + 1)
+            memory = m if live == n else Memory(*(torch.cat((a, b[live:])) for a, b in zip(m, memory, strict=True)))
+    achieved = worth(task, reward, scenes.nearest_m)
+    if start is not None:
+        back = order.argsort()
+        achieved, reward, cells, scores = achieved[back], reward[back], cells[back], scores[back]
+        return Run(achieved, reward, cells, scores, gaze, [])
+    return Run(achieved, reward, cells, scores, Gaze(*(torch.stack(a, -1) for a in zip(*gazes, strict=True))), memories)
