@@ -6,26 +6,23 @@ from functools import partial
 import pytest
 import torch
 
-from torchfovea.acquisition import expected_improvement, log_probability_of_improvement, upper_confidence_bound
+from torchfovea.arena import Fixation, Look, Move, Together, Truth
 from torchfovea.camera import Pinhole
 from torchfovea.correspondence import Budget, Correspondences
 from torchfovea.egosphere import Fusion, Prior
-from torchfovea.episode import Fixation, Look, Move, Truth, run_episode
+from torchfovea.episode import run_episode, run_episodes, stack_minds
 from torchfovea.geometric import correspond_points
 from torchfovea.head import Gaze, Head, clamp_gaze, cyclopean, eyes, fixate, to_ego
 from torchfovea.layout import LogPolar, Uniform
 from torchfovea.perception import Eligibility, Observer, decide, new_mind, perceive
 from torchfovea.setting import SettingError
 from torchfovea.sphere import fibonacci_directions
+from torchfovea.strategies import expected_improvement, probability_of_improvement, upper_confidence_bound
 from torchfovea.unscented import SigmaPoints
 
 HEAD = Head()
 ROOM_M = 3.0
 BALL, RADIUS_M = torch.tensor([0.6, 0.5, -0.1], dtype=torch.float64), 0.12
-
-
-def bound(mean, std, incumbent, alpha):
-    return upper_confidence_bound(mean, std, alpha)
 
 
 def meet(origin: torch.Tensor, direction: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -71,7 +68,7 @@ class Spheres:
 
 
 def small(**changes) -> Observer:
-    settings = {"camera": Pinhole.from_fov(90, 100), "retina": LogPolar(3000), **changes}
+    settings = {"camera": Pinhole.from_fov(90, 100), "retina": LogPolar(1500), **changes}
     return Observer(head=HEAD, **settings)
 
 
@@ -80,15 +77,15 @@ def cells_in_reach(count: int, dtype=torch.float64) -> torch.Tensor:
     return directions[fixate(HEAD, directions)[1]]
 
 
-def run(observer: Observer, seed: int = 0, saccades: int = 8, dtype=torch.float64, cells: int = 6000):
+def run(observer: Observer, seed: int = 0, saccades: int = 8, dtype=torch.float64, cells: int = 4000):
     arena, mind = Spheres(observer), new_mind(observer, cells_in_reach(cells, dtype))
     generator = torch.Generator().manual_seed(seed)
     return run_episode(observer, mind, arena, arena.truth(mind.memory.cells), saccades, generator)
 
 
-@pytest.mark.parametrize("retina", [LogPolar(3000), Uniform(3000)], ids=["log_polar", "uniform"])
+@pytest.mark.parametrize("retina", [LogPolar(1500), Uniform(1500)], ids=["log_polar", "uniform"])
 @pytest.mark.parametrize(
-    "acquisition", [partial(bound, alpha=1.0), log_probability_of_improvement, expected_improvement]
+    "acquisition", [partial(upper_confidence_bound, alpha=1.0), probability_of_improvement, expected_improvement]
 )
 def test_finds_the_ball(retina, acquisition):
     episode = run(small(retina=retina, acquisition=acquisition))
@@ -99,7 +96,7 @@ def test_finds_the_ball(retina, acquisition):
 
 @pytest.mark.parametrize("name", ["printed", "aligned"])
 def test_the_other_fusions_run_to_the_end(name):
-    fusion = Fusion(name, slant=0.0 if name == "printed" else 1.0)
+    fusion = Fusion(name)
     episode = run(
         small(
             fusion=fusion,
@@ -182,6 +179,47 @@ def test_errors_name_the_setting(call, message):
 
 
 def test_alpha_infinity_is_pure_exploration():
-    episode = run(small(acquisition=partial(bound, alpha=math.inf)), saccades=4)
-    greedy = run(small(acquisition=partial(bound, alpha=0.0)), saccades=4)
+    episode = run(small(acquisition=partial(upper_confidence_bound, alpha=math.inf)), saccades=4)
+    greedy = run(small(acquisition=partial(upper_confidence_bound, alpha=0.0)), saccades=4)
     assert episode.global_information[-1] > greedy.global_information[-1]
+
+
+def test_a_batch_is_its_episodes_one_by_one():
+    observer = small(retina=LogPolar(800), acquisition=partial(upper_confidence_bound, alpha=2.0))
+    minds = [new_mind(observer, cells_in_reach(n)[:350]) for n in (3000, 3300)]
+    arena = Spheres(observer)
+    alone = [
+        run_episode(observer, mind, arena, arena.truth(mind.memory.cells), 4, torch.Generator().manual_seed(seed))
+        for seed, mind in enumerate(minds)
+    ]
+    settings = torch.tensor([2.0, 2.0], dtype=torch.float64)
+    together = run_episodes(
+        small(retina=LogPolar(800), acquisition=partial(upper_confidence_bound, alpha=settings)),
+        stack_minds(minds),
+        Together([arena, arena]),
+        [arena.truth(mind.memory.cells) for mind in minds],
+        4,
+        [torch.Generator().manual_seed(seed) for seed in range(2)],
+    )
+    for one, of_many in zip(alone, together, strict=True):
+        for a, b in zip(one.gaze, of_many.gaze, strict=True):
+            assert torch.allclose(a, b, atol=1e-9)
+        assert torch.allclose(one.global_information, of_many.global_information, atol=1e-9)
+        assert one.moves == of_many.moves and one.degrees == pytest.approx(of_many.degrees)
+        assert one.target_error_m == pytest.approx(of_many.target_error_m)
+
+
+def test_the_stop_rule_ends_on_the_best_cell():
+    observer = small(retina=LogPolar(800))
+    arena, mind = Spheres(observer), new_mind(observer, cells_in_reach(1500))
+
+    def search(stop):
+        generator = torch.Generator().manual_seed(0)
+        return run_episode(observer, mind, arena, arena.truth(mind.memory.cells), 9, generator, stop=stop)
+
+    easy, never = search((10.0, 0.5)), search(None)
+    assert easy.looks == 1 and never.looks == 9
+    # after the last look the best cell is fixated, and then nothing changes
+    assert len(easy.gap) == 9 and bool((easy.gaze.pan[1:] == easy.gaze.pan[1]).all())
+    assert torch.equal(easy.global_information, easy.global_information[:1].expand(9))
+    assert easy.degrees < never.degrees

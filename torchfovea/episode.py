@@ -1,93 +1,44 @@
-"""An episode: look, remember, decide, move, and be judged against the truth at every saccade (Sec. 7.2)."""
+"""Episodes: look, remember, decide, move, and be judged against the truth at every saccade (Sec. 7.2).
+
+B episodes advance together as tensors, one generator each, so that a batch is what its episodes are one by one.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchfovea.correspondence import Correspondences
-from torchfovea.head import Gaze, eyes
+from torchfovea.acquisition import known_well_enough
+from torchfovea.arena import Arena, Arenas, Fixation, Look, Move, Together, Truth, row, stack
+from torchfovea.head import Gaze, eyes, fixate
 from torchfovea.metrics import gap, global_information, local_information, near_target, regret, saccades_to_target
-from torchfovea.perception import Mind, Observer, Step, decide, perceive
+from torchfovea.nearest import build_index
+from torchfovea.perception import Mind, Observer, Step, decide, gaze_at, perceive
 from torchfovea.setting import require
 
-__all__ = ["Arena", "Episode", "Fixation", "Look", "Move", "Truth", "run_episode"]
+__all__ = [
+    "Arena",
+    "Arenas",
+    "Episode",
+    "Fixation",
+    "Look",
+    "Move",
+    "Together",
+    "Truth",
+    "run_episode",
+    "run_episodes",
+    "stack_minds",
+]
 
 
-class Move(NamedTuple):
-    """A saccade as executed.
-
-    Attributes:
-        gaze: where the head settled, as its encoders tell.
-        seconds: duration by the motor model.
-        degrees: travelled.
-    """
-
-    gaze: Gaze
-    seconds: float
-    degrees: float
-
-
-class Fixation(NamedTuple):
-    """The truth at a fixation: the first surface on the cyclopean ray.
-
-    Attributes:
-        point: where, in E, (3,); far along the ray for a miss.
-        range_m: its distance from the ego frame's origin; infinite for a miss.
-        is_floor: whether it is the floor.
-        is_target: whether it belongs to the target.
-    """
-
-    point: Tensor
-    range_m: float
-    is_floor: bool
-    is_target: bool
-
-
-class Look(NamedTuple):
-    """What the eyes bring home from one fixation.
-
-    Attributes:
-        matches: correspondences in both retinas.
-        pictures: whatever the sensor wants drawn (images, disparity), or nothing.
-    """
-
-    matches: Correspondences
-    pictures: Any = None
-
-
-class Truth(NamedTuple):
-    """What the judge knows and the observer does not.
-
-    Attributes:
-        nearest_m: range of the nearest reachable point that is not floor.
-        nearest_point: that point in E, (3,).
-        cell_points: the true surface point of each memory cell, (Nx, 3); infinite where there is none.
-    """
-
-    nearest_m: float
-    nearest_point: Tensor
-    cell_points: Tensor
-
-
-class Arena(Protocol):
-    """A place to look around in: simulated, or a robot's."""
-
-    def saccade(self, gaze: Gaze) -> Move:
-        """Move the head and wait until it rests."""
-        ...
-
-    def look(self, gaze: Gaze, generator: torch.Generator) -> Look:
-        """Sense at a gaze."""
-        ...
-
-    def fixation(self, gaze: Gaze) -> Fixation:
-        """The truth at a gaze."""
-        ...
+def stack_minds(minds: Sequence[Mind]) -> Mind:
+    """Empty memories of the same number of cells as one batch (B, Nx), indexed together."""
+    memory = stack([mind.memory for mind in minds])
+    return Mind(memory, build_index(memory.cells), torch.stack([mind.spacing_rad for mind in minds]))
 
 
 class Episode(NamedTuple):
@@ -110,6 +61,7 @@ class Episode(NamedTuple):
         compute_seconds: wall time of sensing and deciding, a saccade.
         step: the last decision, with the memory.
         look: the last look.
+        looks: how many looks were taken; fewer than T where the stop rule ended the search.
     """
 
     gaze: Gaze
@@ -128,6 +80,7 @@ class Episode(NamedTuple):
     compute_seconds: float
     step: Step
     look: Look
+    looks: int
 
 
 def run_episode(
@@ -140,8 +93,9 @@ def run_episode(
     far_m: float = 6.0,
     near_target_m: float = 0.1,
     each: Callable[[int, Look, Step], None] | None = None,
+    stop: tuple[float, float] | None = None,
 ) -> Episode:
-    """Run one episode from straight ahead.
+    """Run one episode from straight ahead; see `run_episodes`.
 
     Args:
         observer: the fixed parts.
@@ -153,55 +107,143 @@ def run_episode(
         far_m: what a fixation on the floor or on nothing counts as.
         near_target_m: R_NN of Eq. 54.
         each: called after every decision with t (from 0), the look and the step.
+        stop: see `run_episodes`.
+
+    Raises:
+        SettingError: for no saccades or a nearest range that is not between 0 and far_m.
+    """
+
+    def show(t: int, look: Look, step: Step) -> None:
+        if each is not None:
+            each(t, Look(row(look.matches, 0), look.pictures[0]), row(step, 0)._replace(mind=one(step.mind)))
+
+    def one(batch: Mind) -> Mind:
+        return Mind(row(batch.memory, 0), mind.lookup, batch.spacing_rad[0])
+
+    alone = Mind(stack([mind.memory]), mind.lookup, mind.spacing_rad[None])
+    episode = run_episodes(
+        observer, alone, Together([arena]), [truth], saccades, [generator], far_m, near_target_m, show, stop
+    )[0]
+    step = episode.step._replace(mind=Mind(episode.step.mind.memory, mind.lookup, mind.spacing_rad))
+    return episode._replace(step=step, look=Look(episode.look.matches, episode.look.pictures[0]))
+
+
+def run_episodes(
+    observer: Observer,
+    mind: Mind,
+    arenas: Arenas,
+    truths: Sequence[Truth],
+    saccades: int,
+    generators: Sequence[torch.Generator],
+    far_m: float = 6.0,
+    near_target_m: float = 0.1,
+    each: Callable[[int, Look, Step], None] | None = None,
+    stop: tuple[float, float] | None = None,
+) -> list[Episode]:
+    """Run B episodes together from straight ahead, on the device of the memories.
+
+    Args:
+        observer: the fixed parts, alike for all; a strategy may have settings (B,).
+        mind: B empty memories, see `stack_minds`.
+        arenas: where.
+        truths: for the metrics only, B.
+        saccades: T ≥ 1, the initial gaze included.
+        generators: one for each episode; the same seed gives the same episode, whatever the batch.
+        far_m: what a fixation on the floor or on nothing counts as.
+        near_target_m: R_NN of Eq. 54.
+        each: called after every decision with t (from 0), the looks and the steps.
+        stop: (tolerance, probability) of `torchfovea.acquisition.known_well_enough`: when it holds, the best cell is
+            fixated, and the head stays there without another look; None: never.
 
     Raises:
         SettingError: for no saccades or a nearest range that is not between 0 and far_m.
     """
     require(saccades >= 1, "saccades", saccades, "at least 1")
-    require(0 < truth.nearest_m < far_m, "far_m", far_m, f"more than the nearest range, {truth.nearest_m:.3f} m")
-    zero = torch.zeros((), dtype=mind.memory.cells.dtype)
-    gaze = Gaze(zero, zero, zero)
-    gazes, fixations, gathered, local = [], [], [], []
-    near = near_target(truth.cell_points, truth.nearest_point, near_target_m)
-    degrees = motor = compute = 0.0
+    for truth in truths:
+        require(0 < truth.nearest_m < far_m, "far_m", far_m, f"more than the nearest range, {truth.nearest_m:.3f} m")
+    cells = mind.memory.cells
+    zero = cells.new_zeros(cells.shape[0])
+    gaze, done = Gaze(zero, zero, zero), torch.zeros_like(zero, dtype=torch.bool)
+    near = torch.stack([near_target(t.cell_points, t.nearest_point, near_target_m) for t in truths]).to(cells.device)
+    moves: list[Move] = []
+    fixations: list[Fixation] = []
+    gathered: list[Tensor] = []
+    local: list[Tensor] = []
+    step: Step | None = None
+    looks, compute = torch.zeros_like(zero), 0.0
     for t in range(saccades):
-        move = arena.saccade(gaze)
-        move = move._replace(gaze=Gaze(*(angle.to(zero) for angle in move.gaze)))
-        degrees, motor = degrees + move.degrees, motor + move.seconds
-        gazes.append(move.gaze)
-        fixations.append(arena.fixation(move.gaze))
+        move = arenas.saccade(gaze)
+        executed = Gaze(*(angle.to(zero) for angle in move.gaze))
+        moves.append(move._replace(gaze=executed))
+        fixations.append(arenas.fixation(executed))
+        if bool(done.all()):  # nobody looks any more
+            left = saccades - t
+            moves += [Move(executed, 0 * move.seconds, 0 * move.degrees)] * (left - 1)
+            fixations += fixations[-1:] * (left - 1)
+            gathered, local = gathered + gathered[-1:] * left, local + local[-1:] * left
+            break
         start = time.perf_counter()
-        look = arena.look(move.gaze, generator)
-        mind = perceive(observer, mind, look.matches, eyes(observer.head, move.gaze))
-        step = decide(observer, mind, generator)
+        look = arenas.look(executed, generators)
+        looks = looks + ~done
+        matches = look.matches._replace(valid=look.matches.valid & ~done[:, None])
+        mind = perceive(observer, mind, matches, eyes(observer.head, executed))
+        step = decide(observer, mind, generators, executed, step)
         compute += time.perf_counter() - start
+        gaze = step.gaze
+        if stop is not None:
+            last = known_well_enough(step.reward.mean, step.reward.std, step.eligible, *stop) & ~done
+            best = torch.where(step.eligible, step.reward.mean, -torch.inf).argmax(-1)
+            final = gaze_at(fixate(observer.head, step.points.mean)[0], best)
+            gaze = Gaze(
+                *(
+                    torch.where(done, now, torch.where(last, end, onward))
+                    for now, end, onward in zip(executed, final, gaze, strict=True)
+                )
+            )
+            done = done | last
         gathered.append(global_information(step.points.cov))
         local.append(local_information(step.points.cov, near)[0])
-        gaze = step.gaze
         if each is not None:
             each(t, look, step)
-    ranges = torch.tensor([f.range_m for f in fixations], dtype=torch.float64)
-    reward = -torch.where(torch.tensor([f.is_floor for f in fixations]), torch.inf, ranges).clamp(max=far_m)
-    hit = torch.tensor([f.is_target for f in fixations])
-    best = torch.tensor(-truth.nearest_m, dtype=torch.float64)
-    return Episode(
-        gaze=Gaze(*(torch.stack(angle).double() for angle in zip(*gazes, strict=True))),
-        direction=torch.nn.functional.normalize(torch.stack([f.point.double() for f in fixations]), dim=-1),
-        range_m=ranges,
-        reward=reward,
-        gap=gap(reward, best),
-        regret=regret(reward, best),
-        global_information=torch.stack(gathered).double(),
-        local_information=torch.stack(local).double() if bool(near.any()) else None,
-        hit=hit,
-        moves=int(saccades_to_target(hit)),
-        target_error_m=_target_error(step, truth),
-        degrees=degrees,
-        motor_seconds=motor,
-        compute_seconds=compute / saccades,
-        step=step,
-        look=look,
-    )
+    assert step is not None
+
+    def over_time(parts: Sequence[Any]) -> Tensor:
+        return torch.stack([torch.as_tensor(part).cpu() for part in parts], -1)
+
+    ranges = over_time([f.range_m for f in fixations]).double()
+    reward = -torch.where(over_time([f.is_floor for f in fixations]), torch.inf, ranges).clamp(max=far_m)
+    hit = over_time([f.is_target for f in fixations])
+    points = torch.stack([f.point.double().cpu() for f in fixations], 1)
+    gazes = [over_time(angle).double() for angle in zip(*(move.gaze for move in moves), strict=True)]
+    informed = over_time(gathered).double()
+    locally = over_time(local).double()
+    far_travelled, took = (over_time([m[k] for m in moves]).double().sum(-1) for k in (2, 1))
+    episodes = []
+    for b, truth in enumerate(truths):
+        best = torch.tensor(-truth.nearest_m, dtype=torch.float64)
+        own = row(step, b)
+        episodes.append(
+            Episode(
+                gaze=Gaze(*(angle[b] for angle in gazes)),
+                direction=torch.nn.functional.normalize(points[b], dim=-1),
+                range_m=ranges[b],
+                reward=reward[b],
+                gap=gap(reward[b], best),
+                regret=regret(reward[b], best),
+                global_information=informed[b],
+                local_information=locally[b] if bool(near[b].any()) else None,
+                hit=hit[b],
+                moves=int(saccades_to_target(hit[b])),
+                target_error_m=_target_error(own, truth),
+                degrees=float(far_travelled[b]),
+                motor_seconds=float(took[b]),
+                compute_seconds=compute / (saccades * len(truths)),
+                step=own,
+                look=Look(row(look.matches, b), look.pictures),
+                looks=int(looks[b]),
+            )
+        )
+    return episodes
 
 
 def _target_error(step: Step, truth: Truth) -> float | None:
@@ -210,4 +252,4 @@ def _target_error(step: Step, truth: Truth) -> float | None:
     if not bool(eligible.any()):
         return None
     best = torch.where(eligible, step.reward.mean, torch.full_like(step.reward.mean, -torch.inf)).argmax()
-    return float((step.points.mean[best] - truth.nearest_point).norm())
+    return float((step.points.mean[best].cpu() - truth.nearest_point.to(step.points.mean.dtype).cpu()).norm())

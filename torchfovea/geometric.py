@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -22,7 +24,7 @@ def correspond_points(
     camera: Camera,
     retina: Retina,
     budget: Budget,
-    generator: torch.Generator | None,
+    generator: torch.Generator | Sequence[torch.Generator] | None,
 ) -> Correspondences:
     """What both retinas would report of surface points that the left receptive fields look at (Eq. 6-7).
 
@@ -34,7 +36,7 @@ def correspond_points(
         camera: both eyes' camera.
         retina: both eyes' retina.
         budget: where the standard deviations come from.
-        generator: draws the noise; None: no noise.
+        generator: draws the noise, one or one for each row of a batch (B, N); None: no noise.
 
     Returns:
         Correspondences; invalid where not visible or outside the right retina. Differentiable in points and poses.
@@ -47,7 +49,15 @@ def correspond_points(
     left_px = left_px.expand_as(right_px)
     left_sigma, right_sigma = eye_sigma_px(budget, retina, left_px), eye_sigma_px(budget, retina, right_px)
     if generator is not None:
-        noise = torch.randn(4, *valid.shape, generator=generator, dtype=points.dtype, device=points.device)
+        noise = _noise(valid.shape, generator, points)
         left_px = left_px + columns(left_sigma * noise[0], left_sigma * noise[1])
         right_px = right_px + columns(right_sigma * noise[2], right_sigma * noise[3])
     return Correspondences(left_px, right_px, left_sigma, right_sigma, valid)
+
+
+def _noise(shape: torch.Size, generator: torch.Generator | Sequence[torch.Generator], like: Tensor) -> Tensor:
+    """Standard normal numbers (4, ...), drawn where the generators live; a row's do not depend on the batch."""
+    if isinstance(generator, torch.Generator):
+        return torch.randn(4, *shape, generator=generator, dtype=like.dtype, device=generator.device).to(like)
+    rows = [torch.randn(4, *shape[1:], generator=g, dtype=like.dtype, device=g.device) for g in generator]
+    return torch.stack(rows, 1).to(like)

@@ -2,34 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchfovea.acquisition import choose, upper_confidence_bound
+from torchfovea.acquisition import Generators, choose
 from torchfovea.camera import Camera, Pinhole
 from torchfovea.correspondence import Budget, Correspondences
 from torchfovea.egosphere import EgoSphere, Fusion, Prior, belief, cartesian_from_patches, new_egosphere, remember
 from torchfovea.gaussian import Gaussian
-from torchfovea.head import Eyes, Gaze, Head, fixate
+from torchfovea.head import Eyes, Gaze, Head, cyclopean, fixate
 from torchfovea.layout import LogPolar, Retina
 from torchfovea.nearest import CellIndex, build_index, neighbour_spacing_rad
 from torchfovea.reward import RewardBelief, inverse_range_from_range, range_from_inverse_range, range_reward
 from torchfovea.setting import require
+from torchfovea.strategies import DEFAULT, Strategy, View, evaluate
 from torchfovea.triangulation import observe
 from torchfovea.unscented import SigmaPoints
 
-__all__ = ["Eligibility", "Mind", "Observer", "Step", "decide", "new_mind", "perceive", "reward_of"]
-
-Acquisition = Callable[[Tensor, Tensor, Tensor], Tensor]
-
-
-def greedy_bound(mean: Tensor, std: Tensor, incumbent: Tensor) -> Tensor:
-    """The default acquisition: the upper confidence bound with α = 1 (Eq. 41)."""
-    return upper_confidence_bound(mean, std, 1.0)
+__all__ = ["Eligibility", "Mind", "Observer", "Step", "decide", "gaze_at", "new_mind", "perceive", "reward_of"]
 
 
 @dataclass(frozen=True)
@@ -63,7 +57,7 @@ class Observer:
         fusion: how observations enter the memory.
         prior: of a cell not yet seen.
         reward: `inverse_range` or `range`: near is good, in either measure (Eq. 36).
-        acquisition: scores cells from (mean, std, incumbent).
+        acquisition: scores the cells, see `torchfovea.strategies`.
         eligibility: which cells may be fixated.
     """
 
@@ -76,7 +70,7 @@ class Observer:
     fusion: Fusion = field(default_factory=Fusion)
     prior: Prior = field(default_factory=Prior)
     reward: str = "inverse_range"
-    acquisition: Acquisition = greedy_bound
+    acquisition: Strategy = DEFAULT
     eligibility: Eligibility = field(default_factory=Eligibility)
 
     def __post_init__(self) -> None:
@@ -108,6 +102,7 @@ class Step(NamedTuple):
         eligible: which cells may be fixated, bool (..., Nx).
         cell: the one chosen, (...) int64; −1 if none is eligible.
         gaze: the fixation that it asks for; straight ahead if none.
+        state: the strategy's own, for the next decision.
     """
 
     mind: Mind
@@ -116,6 +111,7 @@ class Step(NamedTuple):
     eligible: Tensor
     cell: Tensor
     gaze: Gaze
+    state: Any = None
 
 
 def new_mind(observer: Observer, cells: Tensor) -> Mind:
@@ -136,9 +132,11 @@ def perceive(
         eyes: where the eyes were.
         common: see `torchfovea.egosphere.fuse`.
 
-    Differentiable in the correspondences.
+    Differentiable in the correspondences. Where only some of the receptive fields were looked through, each stands for
+    as many more as are missing and covers a wider patch.
     """
-    support = observer.retina.width_px(matches.left_px) / 2
+    share = observer.retina.count / max(1, matches.valid.shape[-1])
+    support = observer.retina.width_px(matches.left_px) / 2 * math.sqrt(max(1.0, share))
     observed = observe(
         matches, eyes, observer.camera, support, observer.points, observer.fusion.chart, observer.rotated
     )
@@ -167,16 +165,24 @@ def reward_of(observer: Observer, mind: Mind) -> tuple[Gaussian, RewardBelief]:
     return points, RewardBelief(*exact)
 
 
-def decide(observer: Observer, mind: Mind, generator: torch.Generator | None = None) -> Step:
+def decide(
+    observer: Observer,
+    mind: Mind,
+    generator: Generators | None = None,
+    gaze: Gaze | None = None,
+    before: Step | None = None,
+) -> Step:
     """Choose the next fixation (Eq. 41-43).
 
     Args:
         observer: the fixed parts.
-        mind: what is known.
-        generator: breaks exact ties.
+        mind: what is known, (...).
+        generator: breaks exact ties, and draws lots for the strategies that do; one, or one for each row.
+        gaze: where the head looks now, (...), for strategies that mind the way; straight ahead if not given.
+        before: the decision before, for strategies that remember.
     """
     points, reward = reward_of(observer, mind)
-    gaze, reachable = fixate(observer.head, points.mean)
+    target, reachable = fixate(observer.head, points.mean)
     seen = mind.memory.looks > 0
     ground = seen & (points.mean[..., 2] + observer.head.ego_height_m < observer.eligibility.ground_z_m)
     far_enough = (points.mean * points.mean).sum(-1) > observer.eligibility.nearest_m**2
@@ -185,7 +191,24 @@ def decide(observer: Observer, mind: Mind, generator: torch.Generator | None = N
     incumbent = torch.where(eligible & seen, reward.mean, floor).amax(-1)
     incumbent = torch.where(torch.isfinite(incumbent), incumbent, torch.where(eligible, reward.mean, floor).amax(-1))
     incumbent = torch.where(torch.isfinite(incumbent), incumbent, torch.zeros_like(incumbent))
-    cell = choose(observer.acquisition(reward.mean, reward.std, incumbent), eligible, generator)
-    chosen = cell.clamp(min=0)[..., None]
-    ahead = (cell >= 0).to(points.mean.dtype)
-    return Step(mind, points, reward, eligible, cell, Gaze(*(g.gather(-1, chosen)[..., 0] * ahead for g in gaze)))
+    zero = torch.zeros_like(incumbent)
+    view = View(
+        reward.mean,
+        reward.std,
+        incumbent,
+        eligible,
+        mind.memory.cells,
+        cyclopean(observer.head, Gaze(zero, zero, zero) if gaze is None else gaze)[0][..., 2],
+        torch.full_like(zero, -1, dtype=torch.int64) if before is None else before.cell,
+        generator,
+        None if before is None else before.state,
+    )
+    score, state = evaluate(observer.acquisition, view)
+    cell = choose(score, eligible, generator)
+    return Step(mind, points, reward, eligible, cell, gaze_at(target, cell), state)
+
+
+def gaze_at(gazes: Gaze, cell: Tensor) -> Gaze:
+    """The gaze of one cell among those of all (..., Nx); straight ahead for cell −1."""
+    chosen, ahead = cell.clamp(min=0)[..., None], (cell >= 0).to(gazes.pan.dtype)
+    return Gaze(*(angle.gather(-1, chosen)[..., 0] * ahead for angle in gazes))

@@ -3,32 +3,31 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
 from typing import Any, Literal, TypeVar, cast
 
 import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from torchfovea import acquisition, sphere
+from torchfovea import sphere
 from torchfovea.camera import Camera, Fisheye, Pinhole
 from torchfovea.correspondence import Budget
 from torchfovea.egosphere import Fusion, Prior
 from torchfovea.head import Head, fixate
 from torchfovea.layout import LogPolar, Retina, Uniform
-from torchfovea.perception import Acquisition, Eligibility, Observer
+from torchfovea.perception import Eligibility, Observer
 from torchfovea.setting import SettingError, require
 from torchfovea.sgbm import SGBM
 from torchfovea.sim.arena import Arena
-from torchfovea.sim.scene import AttentionWorld, Cans, Room, build_scene
+from torchfovea.sim.scene import AttentionWorld, Cans, Room, Scene, build_scene
 from torchfovea.sim.world import World
 from torchfovea.unscented import SigmaPoints
 
 __all__ = [
-    "build_acquisition",
     "build_arena",
     "build_cells",
     "build_observer",
+    "build_scene_of",
     "build_sensor",
     "choice",
     "construct",
@@ -119,27 +118,8 @@ def build_sensor(cfg: DictConfig) -> tuple[Camera, Retina]:
     return (Pinhole if kind == "pinhole" else Fisheye).from_fov(fov_deg, retina.radius_px), retina
 
 
-def build_acquisition(cfg: DictConfig) -> Acquisition:
-    """The acquisition function by its name."""
-    name = choice(cfg, "acquisition.name", ("ucb", "pi", "ei", "log_ei"))
-    if name != "ucb":
-        full = {
-            "pi": "log_probability_of_improvement",
-            "ei": "expected_improvement",
-            "log_ei": "log_expected_improvement",
-        }
-        return getattr(acquisition, full[name])
-    alpha = _typed(cfg.acquisition.alpha, "float", "acquisition.alpha")
-    require(alpha >= 0, "acquisition.alpha", alpha, "a number not below 0; inf is allowed")
-    return partial(_bound, alpha=alpha)
-
-
-def _bound(mean: Tensor, std: Tensor, incumbent: Tensor, alpha: float) -> Tensor:
-    return acquisition.upper_confidence_bound(mean, std, alpha)
-
-
 def build_observer(cfg: DictConfig) -> Observer:
-    """The observer that a configuration describes."""
+    """The observer that a configuration describes; its strategy is `torchfovea.experiments.strategy`'s to build."""
     camera, retina = build_sensor(cfg)
     printed = choice(cfg, "budget.sigma_points", ("ours", "paper")) == "paper"
     return Observer(
@@ -156,7 +136,6 @@ def build_observer(cfg: DictConfig) -> Observer:
         fusion=construct(Fusion, cfg.fusion, "fusion"),
         prior=construct(Prior, cfg.prior, "prior"),
         reward=choice(cfg, "reward.name", ("inverse_range", "range")),
-        acquisition=build_acquisition(cfg),
         eligibility=construct(Eligibility, cfg.eligibility, "eligibility"),
     )
 
@@ -191,15 +170,20 @@ def build_cells(cfg: DictConfig, head: Head, generator: torch.Generator, dtype: 
     return sphere.sample(mixture, count, generator, reachable).to(dtype)
 
 
-def build_arena(cfg: DictConfig, observer: Observer, seed: int) -> Arena:
-    """The simulated world of an episode."""
+def build_scene_of(cfg: DictConfig, head: Head, seed: int) -> Scene:
+    """The scene of a configuration's group `scene`."""
     name = choice(cfg, "scene.name", ("attention_world", "cans"))
     room = construct(Room, cfg.scene.room, "scene.room") if "room" in cfg.scene else Room()
     fields = {key: value for key, value in cfg.scene.items() if key not in ("name", "room")}
     params = (
         construct(AttentionWorld, fields, "scene") if name == "attention_world" else construct(Cans, fields, "scene")
     )
-    scene = build_scene(dataclasses.replace(params, room=room), seed, observer.head)
+    return build_scene(dataclasses.replace(params, room=room), seed, head)
+
+
+def build_arena(cfg: DictConfig, observer: Observer, seed: int) -> Arena:
+    """The simulated world of an episode."""
+    scene = build_scene_of(cfg, observer.head, seed)
     fidelity = choice(cfg, "fidelity", ("photometric", "geometric"))
     world = World(
         scene,
@@ -210,7 +194,8 @@ def build_arena(cfg: DictConfig, observer: Observer, seed: int) -> Arena:
         radius_px=observer.retina.radius_px,
     )
     matcher = build_matcher(cfg)  # checked even where it is not used
-    return Arena(world, observer, None if fidelity == "geometric" else matcher)
+    sample = None if OmegaConf.select(cfg, "sensor.sample") is None else whole(cfg, "sensor.sample", 16)
+    return Arena(world, observer, None if fidelity == "geometric" else matcher, sample)
 
 
 def build_matcher(cfg: DictConfig) -> tuple[SGBM, float]:

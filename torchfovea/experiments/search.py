@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import statistics
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from torchfovea.arena import Look
 from torchfovea.config import run_folder
-from torchfovea.episode import Episode, Look, run_episode
-from torchfovea.experiments.build import build_arena, build_cells, build_observer, number, whole
+from torchfovea.episode import Episode
+from torchfovea.experiments.build import build_matcher, build_observer, choice, whole
+from torchfovea.experiments.manifest import finished
+from torchfovea.experiments.rollout import batched, one_episode, roll_out
+from torchfovea.experiments.strategy import build_strategy
 from torchfovea.files import write_csv, write_result
-from torchfovea.perception import Step, new_mind
+from torchfovea.perception import Observer, Step
 
 __all__ = ["EPISODE_COLUMNS", "SACCADE_COLUMNS", "episode_row", "run", "saccade_rows", "summarize"]
 
@@ -35,10 +42,12 @@ def run(cfg: DictConfig) -> float:
     """Run the episodes of a configuration; the mean gap per saccade is what a sweeper sees."""
     episodes, saccades, seed = whole(cfg, "episodes"), whole(cfg, "saccades"), whole(cfg, "seed", 0)
     observer, folder = build_observer(cfg), run_folder()
-    far_m, near_target_m = number(cfg, "far_m"), number(cfg, "near_target_m")
-    rows: list[tuple[Any, ...]] = []
-    steps: list[tuple[Any, ...]] = []
-    last: Episode | None = None
+    done = finished(cfg, folder)
+    if done is not None:
+        return done
+    choice(cfg, "fidelity", ("photometric", "geometric"))
+    choice(cfg, "motor", ("instant", "physics"))
+    build_strategy(cfg, observer), build_matcher(cfg)  # mistakes come first, also in what is not used
     bars = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -47,28 +56,73 @@ def run(cfg: DictConfig) -> float:
         TimeRemainingColumn(),
     )
     console = Console(stderr=True)
+    rows: list[tuple[Any, ...]] = []
+    steps: list[tuple[Any, ...]] = []
+    last: Episode | None = None
     with Progress(*bars, console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("search", total=episodes * saccades)
-        for k in range(episodes):
-            generator = torch.Generator().manual_seed(seed + k)
-            arena = build_arena(cfg, observer, seed + k)
-            mind = new_mind(observer, build_cells(cfg, observer.head, generator))
 
-            def show(t: int, look: Look, step: Step, k: int = k) -> None:
-                progress.update(task, advance=1, description=f"episode {k + 1}/{episodes}")
+        def advance(count: int) -> Callable[[int, Look, Step], None]:
+            return lambda t, look, step: progress.update(task, advance=count)
 
-            truth = arena.truth(mind.memory.cells)
-            last = run_episode(observer, mind, arena, truth, saccades, generator, far_m, near_target_m, show)
-            rows.append((k, seed + k, *episode_row(last)))
-            steps.extend((k, *row) for row in saccade_rows(last))
-    assert last is not None
+        for k, row, course, episode in _episodes(cfg, observer, [seed + k for k in range(episodes)], advance):
+            last = episode
+            rows.append((k, seed + k, *row))
+            steps.extend((k, *line) for line in course)
     write_csv(folder / "episodes.csv", EPISODE_COLUMNS, rows)
     write_csv(folder / "saccades.csv", SACCADE_COLUMNS, steps)
+    assert last is not None
     _draw(folder, cfg, observer.retina, last, rows[-1])
     figures = summarize(rows)
     write_result(folder, figures)
     _print(figures)
     return float(figures["gap_per_saccade"])
+
+
+Outcome = tuple[int, tuple[Any, ...], list[tuple[Any, ...]], Episode | None]
+
+
+def _episodes(
+    cfg: DictConfig, observer: Observer, seeds: list[int], advance: Callable[[int], Callable[[int, Look, Step], None]]
+) -> Iterator[Outcome]:
+    """Number, figures and course of every episode in order; the last one's episode itself besides."""
+    workers, final = whole(cfg, "workers"), len(seeds) - 1
+    if batched(cfg):
+        size = whole(cfg, "batch")
+        for start in range(0, len(seeds), size):
+            part = seeds[start : start + size]
+            together = roll_out(cfg, observer, part, each=advance(len(part)))
+            for k, episode in enumerate(together, start):
+                yield k, episode_row(episode), saccade_rows(episode), episode if k == final else None
+        return
+    if workers == 1 or final == 0:
+        for k, seed in enumerate(seeds):
+            episode = one_episode(cfg, observer, seed, advance(1))
+            yield k, episode_row(episode), saccade_rows(episode), episode if k == final else None
+        return
+    # The last episode runs here, where it is drawn; the others in processes of their own.
+    settings = OmegaConf.to_yaml(OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"]), resolve=True)
+    with ProcessPoolExecutor(workers, get_context("spawn"), torch.set_num_threads, (1,)) as pool:
+        waiting = [pool.submit(_elsewhere, settings, seed) for seed in seeds[:-1]]
+        try:
+            last = one_episode(cfg, observer, seeds[-1], advance(1))
+            for k, future in enumerate(waiting):
+                row, course = future.result()
+                advance(whole(cfg, "saccades"))(0, last.look, last.step)
+                yield k, row, course, None
+        except BaseException:
+            for future in waiting:
+                future.cancel()
+            raise
+    yield final, episode_row(last), saccade_rows(last), last
+
+
+def _elsewhere(settings: str, seed: int) -> tuple[tuple[Any, ...], list[tuple[Any, ...]]]:
+    """An episode in a process of its own."""
+    cfg = OmegaConf.create(settings)
+    assert isinstance(cfg, DictConfig)
+    episode = one_episode(cfg, build_observer(cfg), seed)
+    return episode_row(episode), saccade_rows(episode)
 
 
 def episode_row(episode: Episode) -> tuple[Any, ...]:

@@ -7,15 +7,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchfovea.episode import Fixation, Look, Move, Truth
+from torchfovea.arena import Fixation, Look, Move, Truth
+from torchfovea.correspondence import Correspondences
 from torchfovea.geometric import correspond_points
 from torchfovea.head import Gaze, eyes
 from torchfovea.matching import Disparity, match_sgbm, verged
 from torchfovea.perception import Observer
 from torchfovea.sgbm import SGBM
+from torchfovea.sim.truth import truth_of
 from torchfovea.sim.world import World
 
-__all__ = ["Arena", "Pictures"]
+__all__ = ["Arena", "Pictures", "draw_fields"]
 
 
 class Pictures(NamedTuple):
@@ -39,10 +41,13 @@ class Arena:
         world: the scene with its head, renderer and motor.
         observer: whose retina and error budget the sensor has.
         matcher: SGBM's parameters and the nearest range it searches [m]; None: the geometric sensor.
+        sample: how many receptive fields a look goes through, drawn anew each time; None: all of them.
     """
 
-    def __init__(self, world: World, observer: Observer, matcher: tuple[SGBM, float] | None) -> None:
-        self.world, self.observer, self.matcher = world, observer, matcher
+    def __init__(
+        self, world: World, observer: Observer, matcher: tuple[SGBM, float] | None, sample: int | None = None
+    ) -> None:
+        self.world, self.observer, self.matcher, self.sample = world, observer, matcher, sample
 
     def saccade(self, gaze: Gaze) -> Move:
         """Move the head and wait until it rests."""
@@ -63,8 +68,14 @@ class Arena:
             matches, disparity = match_sgbm(
                 left.image, right.image, rig, observer.camera, observer.retina, params, observer.budget, nearest_m
             )
+            chosen = draw_fields(observer.retina.count, self.sample, generator)
+            if chosen is not None:
+                matches = Correspondences(*(part[chosen] for part in matches))
             return Look(matches, Pictures(left.image, right.image, disparity))
         left_px = observer.retina.centers_px(dtype=gaze.pan.dtype)
+        chosen = draw_fields(observer.retina.count, self.sample, generator)
+        if chosen is not None:
+            left_px = left_px[chosen]
         seen = self.world.correspond(gaze, observer.camera.rays(left_px))
         visible = seen.hit & seen.visible_right
         pose = eyes(observer.head, gaze)
@@ -76,8 +87,11 @@ class Arena:
 
     def truth(self, cells: Tensor) -> Truth:
         """What the judge knows: the nearest point, and the surface behind every memory cell (Nx, 3)."""
-        hits = self.world.panorama(cells)
-        points = hits.range_m.to(cells)[:, None] * cells
-        points = torch.where((hits.geom >= 0)[:, None], points, torch.full_like(points, torch.inf))
-        scene = self.world.scene
-        return Truth(float(scene.nearest_range_m), scene.nearest_point_e.to(cells), points)
+        return truth_of(self.world.scene, cells)
+
+
+def draw_fields(count: int, sample: int | None, generator: torch.Generator) -> Tensor | None:
+    """Some of `count` receptive fields, each with the same chance, in ascending order; None: all of them."""
+    if sample is None or sample >= count:
+        return None
+    return torch.randperm(count, generator=generator, device=generator.device)[:sample].sort().values.cpu()

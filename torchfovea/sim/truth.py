@@ -7,11 +7,12 @@ import math
 import torch
 from torch import Tensor
 
+from torchfovea.arena import Truth
 from torchfovea.head import Head, fixate
 from torchfovea.sim.model import Nearest, Scene
 from torchfovea.sim.rays import RayHits, cast
 
-__all__ = ["find_nearest", "reachable_directions"]
+__all__ = ["find_nearest", "reachable_directions", "truth_of"]
 
 _STARTS = 6  # places of the coarse grid that are refined
 _HALF = 10  # a refinement looks at (2·10 + 1)² rays
@@ -84,3 +85,11 @@ def find_nearest(scene: Scene, step_deg: float = 0.3) -> Nearest:
                 best = Nearest(far[k] * direction[k], float(far[k]), int(hits.geom[k]))
             azimuth, elevation, width = a[k], e[k], width * 0.25
     return best
+
+
+def truth_of(scene: Scene, cells: Tensor) -> Truth:
+    """What the judge of an episode knows: the nearest point, and the surface behind every memory cell (Nx, 3)."""
+    hits = cast(scene, torch.zeros(3, dtype=torch.float64), cells)
+    points = hits.range_m.to(cells)[:, None] * cells
+    points = torch.where((hits.geom >= 0)[:, None], points, torch.full_like(points, torch.inf))
+    return Truth(float(scene.nearest_range_m), scene.nearest_point_e.to(cells), points)

@@ -1,0 +1,151 @@
+"""What an episode asks of the world: arenas to look around in, one by one or B at once, and the truth about them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from torchfovea.correspondence import Correspondences
+from torchfovea.head import Gaze
+
+__all__ = ["Arena", "Arenas", "Fixation", "Look", "Move", "Together", "Truth", "row", "stack"]
+
+
+class Move(NamedTuple):
+    """A saccade as executed, or B of them: numbers are tensors (B,) then.
+
+    Attributes:
+        gaze: where the head settled, as its encoders tell.
+        seconds: duration by the motor model.
+        degrees: travelled.
+    """
+
+    gaze: Gaze
+    seconds: float | Tensor
+    degrees: float | Tensor
+
+
+class Fixation(NamedTuple):
+    """The truth at a fixation, the first surface on the cyclopean ray, or at B of them: numbers are tensors (B,) then.
+
+    Attributes:
+        point: where, in E, (3,); far along the ray for a miss.
+        range_m: its distance from the ego frame's origin; infinite for a miss.
+        is_floor: whether it is the floor.
+        is_target: whether it belongs to the target.
+    """
+
+    point: Tensor
+    range_m: float | Tensor
+    is_floor: bool | Tensor
+    is_target: bool | Tensor
+
+
+class Look(NamedTuple):
+    """What the eyes bring home from one fixation.
+
+    Attributes:
+        matches: correspondences in both retinas.
+        pictures: whatever the sensor wants drawn (images, disparity), or nothing.
+    """
+
+    matches: Correspondences
+    pictures: Any = None
+
+
+class Truth(NamedTuple):
+    """What the judge knows and the observer does not.
+
+    Attributes:
+        nearest_m: range of the nearest reachable point that is not floor.
+        nearest_point: that point in E, (3,).
+        cell_points: the true surface point of each memory cell, (Nx, 3); infinite where there is none.
+    """
+
+    nearest_m: float
+    nearest_point: Tensor
+    cell_points: Tensor
+
+
+class Arena(Protocol):
+    """A place to look around in: simulated, or a robot's."""
+
+    def saccade(self, gaze: Gaze) -> Move:
+        """Move the head and wait until it rests."""
+        ...
+
+    def look(self, gaze: Gaze, generator: torch.Generator) -> Look:
+        """Sense at a gaze."""
+        ...
+
+    def fixation(self, gaze: Gaze) -> Fixation:
+        """The truth at a gaze."""
+        ...
+
+
+class Arenas(Protocol):
+    """B places that are looked around in together."""
+
+    def saccade(self, gaze: Gaze) -> Move:
+        """Move each head; gaze and all that comes back are (B,)."""
+        ...
+
+    def look(self, gaze: Gaze, generators: Sequence[torch.Generator]) -> Look:
+        """Sense at each gaze; the correspondences are (B, N)."""
+        ...
+
+    def fixation(self, gaze: Gaze) -> Fixation:
+        """The truth at each gaze."""
+        ...
+
+
+class Together:
+    """Arenas one after the other, as a batch.
+
+    Args:
+        arenas: whose looks have the same number of receptive fields.
+    """
+
+    def __init__(self, arenas: Sequence[Arena]) -> None:
+        self.arenas = arenas
+
+    def _each(self, gaze: Gaze) -> list[tuple[Arena, Gaze]]:
+        return [(arena, Gaze(*(angle[b] for angle in gaze))) for b, arena in enumerate(self.arenas)]
+
+    def saccade(self, gaze: Gaze) -> Move:
+        """Move each head."""
+        return Move(*stack([arena.saccade(one) for arena, one in self._each(gaze)]))
+
+    def look(self, gaze: Gaze, generators: Sequence[torch.Generator]) -> Look:
+        """Sense at each gaze; the pictures are a list."""
+        looks = [
+            arena.look(one, generator) for (arena, one), generator in zip(self._each(gaze), generators, strict=True)
+        ]
+        return Look(stack([look.matches for look in looks]), [look.pictures for look in looks])
+
+    def fixation(self, gaze: Gaze) -> Fixation:
+        """The truth at each gaze."""
+        return Fixation(*stack([arena.fixation(one) for arena, one in self._each(gaze)]))
+
+
+def stack(rows: Sequence[Any]) -> Any:
+    """Rows of nested named tuples of tensors and numbers, as one with a leading axis."""
+    first = rows[0]
+    if isinstance(first, tuple):
+        return type(first)(*(stack(parts) for parts in zip(*rows, strict=True)))
+    if isinstance(first, bool):
+        return torch.tensor(rows)
+    if isinstance(first, float | int):
+        return torch.tensor(rows, dtype=torch.float64)
+    return torch.stack(list(rows))
+
+
+def row(value: Any, b: int) -> Any:
+    """Row b of every tensor in nested tuples; whatever else stays as it is."""
+    if isinstance(value, tuple):
+        parts = [row(part, b) for part in value]
+        return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
+    return value[b] if isinstance(value, Tensor) else value

@@ -1,0 +1,126 @@
+"""Episodes of a configuration: one by one, or many at once by the geometric sensor."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+
+from torchfovea.arena import Look, Truth, stack
+from torchfovea.episode import Episode, run_episode, run_episodes, stack_minds
+from torchfovea.experiments.build import build_arena, build_cells, build_scene_of, number, whole
+from torchfovea.experiments.strategy import build_stop, build_strategy
+from torchfovea.head import Head
+from torchfovea.perception import Mind, Observer, Step, new_mind
+from torchfovea.setting import require
+from torchfovea.sim.arenas import GeometricArenas
+from torchfovea.sim.model import Scene
+from torchfovea.sim.truth import truth_of
+from torchfovea.strategies import Strategy
+
+__all__ = ["batched", "one_episode", "prepare", "roll_out", "sample_of"]
+
+StrategyFor = Callable[[Sequence[Truth]], Strategy]
+
+
+def batched(cfg: DictConfig) -> bool:
+    """Whether the episodes of a configuration can advance together."""
+    return cfg.fidelity == "geometric" and cfg.motor == "instant"
+
+
+def sample_of(cfg: DictConfig) -> int | None:
+    """How many receptive fields a look goes through; None: all."""
+    return None if OmegaConf.select(cfg, "sensor.sample") is None else whole(cfg, "sensor.sample", 16)
+
+
+def one_episode(
+    cfg: DictConfig, observer: Observer, seed: int, each: Callable[[int, Look, Step], None] | None = None
+) -> Episode:
+    """The episode of one seed, with whatever sensor, renderer and motor."""
+    generator = torch.Generator().manual_seed(seed)
+    arena = build_arena(cfg, observer, seed)
+    mind = new_mind(observer, build_cells(cfg, observer.head, generator))
+    truth = arena.truth(mind.memory.cells)
+    observer = dataclasses.replace(observer, acquisition=build_strategy(cfg, observer, _aim(truth)))
+    return run_episode(
+        observer, mind, arena, truth, whole(cfg, "saccades"), generator, number(cfg, "far_m"),
+        number(cfg, "near_target_m"), each, build_stop(cfg),
+    )  # fmt: skip
+
+
+def _aim(truth: Truth) -> Tensor:
+    return torch.nn.functional.normalize(truth.nearest_point, dim=-1)
+
+
+@lru_cache(maxsize=64)
+def _scene(settings: str, head: Head, seed: int) -> Scene:
+    return build_scene_of(OmegaConf.create(settings), head, seed)
+
+
+@lru_cache(maxsize=64)
+def _start(settings: str, observer: Observer, seed: int) -> tuple[Mind, Tensor]:
+    """The memory of a seed, and where its generator stands after its cells were drawn."""
+    generator = torch.Generator().manual_seed(seed)
+    mind = new_mind(observer, build_cells(OmegaConf.create(settings), observer.head, generator))
+    return mind, generator.get_state()
+
+
+def prepare(cfg: DictConfig, observer: Observer, seed: int) -> tuple[Scene, Mind, Truth, torch.Generator]:
+    """What an episode starts from; scenes and memories are kept for the next call with the same settings."""
+    scene = _scene(OmegaConf.to_yaml(OmegaConf.masked_copy(cfg, ["scene"]), resolve=True), observer.head, seed)
+    plain = dataclasses.replace(observer, acquisition=Observer().acquisition)
+    mind, state = _start(OmegaConf.to_yaml(OmegaConf.masked_copy(cfg, ["memory"]), resolve=True), plain, seed)
+    generator = torch.Generator()
+    generator.set_state(state)
+    return scene, mind, truth_of(scene, mind.memory.cells), generator
+
+
+def roll_out(
+    cfg: DictConfig,
+    observer: Observer,
+    seeds: Sequence[int],
+    strategy: StrategyFor | None = None,
+    each: Callable[[int, Any, Any], None] | None = None,
+) -> list[Episode]:
+    """Episodes of several seeds (a seed may come more than once) together, by the geometric sensor.
+
+    Args:
+        cfg: a search's.
+        observer: of that configuration.
+        seeds: one for each episode.
+        strategy: from the truths to a strategy for them all; by default the configuration's.
+        each: see `torchfovea.episode.run_episodes`.
+    """
+    parts = [prepare(cfg, observer, seed) for seed in seeds]
+    scenes, minds, truths, generators = (list(part) for part in zip(*parts, strict=True))
+    device = str(OmegaConf.select(cfg, "device") or "cpu")
+    require(device == "cpu" or torch.cuda.is_available(), "device", device, "cpu, or cuda on a machine that has it")
+    mind = _to(stack_minds(minds), device)
+    if strategy is None:
+        aims = stack([_aim(truth) for truth in truths]).to(device)
+        chosen = build_strategy(cfg, observer, aims)
+    else:
+        chosen = strategy(truths)
+    return run_episodes(
+        dataclasses.replace(observer, acquisition=chosen),
+        mind,
+        GeometricArenas(scenes, observer, sample_of(cfg), device),
+        truths,
+        whole(cfg, "saccades"),
+        generators,
+        number(cfg, "far_m"),
+        number(cfg, "near_target_m"),
+        each,
+        build_stop(cfg),
+    )
+
+
+def _to(value: Any, device: str) -> Any:
+    if isinstance(value, tuple):
+        return type(value)(*(_to(part, device) for part in value))
+    return value.to(device) if isinstance(value, Tensor) else value

@@ -1,0 +1,100 @@
+"""Many simulated arenas that are sensed together, on any device, by the geometric sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchfovea.arena import Fixation, Look, Move
+from torchfovea.geometric import correspond_points
+from torchfovea.head import Gaze, clamp_gaze, cyclopean, eyes, to_ego
+from torchfovea.perception import Observer
+from torchfovea.sim.arena import draw_fields
+from torchfovea.sim.model import Scene
+from torchfovea.sim.motor import InstantMotor
+from torchfovea.sim.rays import MISS_RANGE_M
+from torchfovea.sim.room import FLOOR, TARGET
+from torchfovea.sim.trace import occluded, solids_of, trace
+
+__all__ = ["GeometricArenas"]
+
+
+class GeometricArenas:
+    """B scenes seen by observers of one kind: what `torchfovea.sim.arena.Arena` does for one.
+
+    Args:
+        scenes: B, built for the observer's head; one may appear several times.
+        observer: whose retina and error budget the sensor has.
+        sample: how many receptive fields a look goes through, drawn anew each time; None: all of them.
+        device: where rays are traced, in float64.
+        motor: its model of durations.
+    """
+
+    def __init__(
+        self,
+        scenes: Sequence[Scene],
+        observer: Observer,
+        sample: int | None = None,
+        device: torch.device | str = "cpu",
+        motor: InstantMotor | None = None,
+    ) -> None:
+        self.observer, self.sample, self.motor = observer, sample, motor or InstantMotor()
+        self.solids = solids_of(scenes, device)
+        most = max(len(scene.kind) for scene in scenes)
+        self.kind = torch.stack(
+            [torch.nn.functional.pad(scene.kind, (0, most - len(scene.kind)), value=-1) for scene in scenes]
+        ).to(device)
+        self.before = torch.zeros(len(scenes), 3, dtype=torch.float64)
+
+    def saccade(self, gaze: Gaze) -> Move:
+        """Turn each head to its gaze, clamped to the limits."""
+        head = self.observer.head
+        command = clamp_gaze(head, Gaze(*(angle.detach().cpu().double() for angle in gaze)))
+        last = Gaze(*self.before.unbind(-1))
+        a, b = (cyclopean(head, g)[0][..., 2] for g in (last, command))
+        degrees = torch.rad2deg(torch.atan2(torch.linalg.cross(a, b).square().sum(-1).sqrt(), (a * b).sum(-1)))
+        seconds = [
+            self.motor.duration_s(Gaze(*then), Gaze(*now))
+            for then, now in zip(zip(*last, strict=True), zip(*command, strict=True), strict=True)
+        ]
+        self.before = torch.stack(command, -1)
+        return Move(command, torch.tensor(seconds, dtype=torch.float64), degrees)
+
+    def fixation(self, gaze: Gaze) -> Fixation:
+        """The first surface on each cyclopean ray."""
+        rotation, origin = cyclopean(self.observer.head, Gaze(*(angle.to(self.kind.device).double() for angle in gaze)))
+        range_m, geom = trace(self.solids, origin, rotation[:, None, :, 2])
+        point = origin + range_m * rotation[..., 2]
+        kind = torch.where(geom >= 0, self.kind.gather(1, geom.clamp(min=0)), -1)[:, 0]
+        return Fixation(point, point.square().sum(-1).sqrt(), kind == FLOOR, kind == TARGET)
+
+    def look(self, gaze: Gaze, generators: Sequence[torch.Generator]) -> Look:
+        """Sense at each gaze; each generator draws its episode's receptive fields and noise."""
+        observer, device = self.observer, gaze.pan.device
+        pose = eyes(observer.head, gaze)
+        left_px = observer.retina.centers_px(device, gaze.pan.dtype)
+        chosen = [draw_fields(observer.retina.count, self.sample, generator) for generator in generators]
+        if any(index is not None for index in chosen):
+            left_px = left_px[torch.stack([index for index in chosen if index is not None]).to(device)]
+        points, visible = self._surfaces(gaze, observer.camera.rays(left_px))
+        return Look(
+            correspond_points(
+                points, visible, left_px, pose, observer.camera, observer.retina, observer.budget, generators
+            )
+        )
+
+    def _surfaces(self, gaze: Gaze, left_rays: Tensor) -> tuple[Tensor, Tensor]:
+        """What each left ray meets, and whether the right eye sees it; see `torchfovea.sim.world.World.correspond`."""
+        pose = eyes(self.observer.head, Gaze(*(angle.detach().double() for angle in gaze)))
+        x, y, z = left_rays.double().unbind(-1)
+        scale = torch.rsqrt(x * x + y * y + z * z)
+        unit = torch.stack([x * scale, y * scale, z * scale]).movedim(0, -1)
+        direction = to_ego(pose.R_left, unit.expand(len(self.kind), -1, -1))
+        range_m, geom = trace(self.solids, pose.t_left, direction)
+        points = pose.t_left[:, None] + range_m[..., None] * direction
+        line = points - pose.t_right[:, None]
+        ahead = (line * pose.R_right[:, None, :, 2]).sum(-1) > 0
+        visible = (geom >= 0) & (range_m < MISS_RANGE_M) & ahead & ~occluded(self.solids, pose.t_right, points)
+        return points.to(left_rays.dtype), visible
