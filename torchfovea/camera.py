@@ -45,8 +45,12 @@ class Pinhole:
 
     def rays(self, px: Tensor) -> Tensor:
         """Directions of pixels, (..., 2) to (..., 3) with z = 1. Differentiable."""
-        u, v = px.unbind(-1)
-        return columns((u - self.cx_px) / self.focal_px, (v - self.cy_px) / self.focal_px, torch.ones_like(u))
+        return columns(*self.ray_components(*px.unbind(-1)))
+
+    def ray_components(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """`rays` by components: x, y (...) and z, which is 1 and has no axes."""
+        x, y = ((c - centre if centre else c) * (1 / self.focal_px) for c, centre in ((u, self.cx_px), (v, self.cy_px)))
+        return x, y, u.new_ones(())
 
     def project(self, direction: Tensor) -> Tensor:
         """Pixels of directions, (..., 3) to (..., 2); finite, and meaningless where `in_view` is false.
@@ -88,7 +92,10 @@ class Fisheye:
 
     def rays(self, px: Tensor) -> Tensor:
         """Unit directions of pixels, (..., 2) to (..., 3). Differentiable, at the centre too."""
-        u, v = px.unbind(-1)
+        return columns(*self.ray_components(*px.unbind(-1)))
+
+    def ray_components(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """`rays` by components: x, y, z (...)."""
         a, b = (u - self.cx_px) / self.focal_px, (v - self.cy_px) / self.focal_px
         # sin(θ)/θ as sinc keeps value and gradient finite at the centre
         square = a * a + b * b
@@ -96,7 +103,7 @@ class Fisheye:
         theta = torch.where(away, square, torch.ones_like(square)).sqrt()
         ratio = torch.where(away, torch.sin(theta) / theta, 1 - square / 6)
         cosine = torch.where(away, torch.cos(theta), 1 - square / 2)
-        return columns(a * ratio, b * ratio, cosine)
+        return a * ratio, b * ratio, cosine
 
     def project(self, direction: Tensor) -> Tensor:
         """Pixels of directions, (..., 3) to (..., 2); finite, and meaningless straight behind. Differentiable."""

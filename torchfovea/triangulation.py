@@ -8,14 +8,17 @@ import torch
 from torch import Tensor
 
 from torchfovea.camera import Camera
-from torchfovea.chart import basis, inverse_range_coordinates
+from torchfovea.chart import basis
 from torchfovea.correspondence import Correspondences
 from torchfovea.gaussian import columns, positive_definite
 from torchfovea.head import Eyes, to_ego as turn
 from torchfovea.setting import require
-from torchfovea.unscented import SigmaPoints, unscented_transform
+from torchfovea.unscented import SigmaPoints, moments, sigma_components
 
 __all__ = ["Observations", "observe", "rig_frame", "sigma_root", "triangulate", "triangulate_rectified"]
+
+BLOCK = 8192
+Components = tuple[Tensor, ...]
 
 
 class Observations(NamedTuple):
@@ -34,6 +37,16 @@ class Observations(NamedTuple):
     direction: Tensor
     support_rad: Tensor
     valid: Tensor
+
+
+def _dot(a: Components, b: Components) -> Tensor:
+    return torch.addcmul(torch.addcmul(a[0] * b[0], a[1], b[1]), a[2], b[2])
+
+
+def _turned(rotation: Tensor, vector: Components) -> Components:
+    """`torchfovea.head.to_ego` by components: R v, rotation (..., 3, 3) and v's (*any, ..., N)."""
+    row = [[rotation[..., i, j].unsqueeze(-1) for j in range(3)] for i in range(3)]
+    return tuple(torch.addcmul(torch.addcmul(r[2] * vector[2], r[0], vector[0]), r[1], vector[1]) for r in row)
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
@@ -95,17 +108,23 @@ def triangulate_rectified(left: Tensor, right: Tensor, baseline_m: Tensor) -> tu
 
     Differentiable.
     """
-    xl, yl, zl = left.unbind(-1)
-    xr, yr, zr = right.unbind(-1)
-    ahead = (zl > 0) & (zr > 0)
+    (x, y, z), w, least = _rectified(left.unbind(-1), right.unbind(-1))
+    half, ahead = baseline_m / 2, least > 0
+    seen = ahead[..., None]
+    point = columns(half * x, half * y, half * z)
+    return torch.where(seen, point, torch.ones_like(point)), torch.where(ahead, w, torch.ones_like(w)), ahead
+
+
+def _rectified(left: Components, right: Components) -> tuple[Components, Tensor, Tensor]:
+    """2 X/b and w of `triangulate_rectified`, and how far ahead the rays look (> 0: both do)."""
+    xl, yl, zl = left
+    xr, yr, zr = right
     across, back = xl * zr, xr * zl
-    half = baseline_m / 2
-    x = columns(half * (across + back), half * torch.addcmul(yl * zr, yr, zl), baseline_m * (zl * zr))
-    w = across - back
-    if not bool(ahead.all()):
-        x = torch.where(ahead[..., None], x, torch.ones_like(x))
-        w = torch.where(ahead, w, torch.ones_like(w))
-    return x, w, ahead
+    return (
+        (across + back, torch.addcmul(yl * zr, yr, zl), 2 * (zl * zr)),
+        across - back,
+        torch.minimum(zl, zr),
+    )
 
 
 def rig_frame(eyes: Eyes) -> tuple[Tensor, Tensor, Tensor]:
@@ -149,20 +168,27 @@ def sigma_root(left_sigma: Tensor, right_sigma: Tensor, rotated: bool = True) ->
         (..., 4, 4), Σ = root rootᵀ. Differentiable.
     """
     zero = torch.zeros_like(left_sigma)
+    rows = _root_rows(left_sigma, right_sigma, rotated)
+    return columns(*(zero if entry is None else entry for row in rows for entry in row)).unflatten(-1, (4, 4))
+
+
+def _root_rows(left: Tensor, right: Tensor, rotated: bool) -> list[list[Tensor | None]]:
+    """The rows of `sigma_root`, None for zero."""
     if not rotated:
-        rows = [[left_sigma, zero, zero, zero], [zero, left_sigma, zero, zero]]
-        rows += [[zero, zero, right_sigma, zero], [zero, zero, zero, right_sigma]]
-    else:
-        scale = (left_sigma * left_sigma + right_sigma * right_sigma).rsqrt()
-        left, right, both = left_sigma**2 * scale, -(right_sigma**2) * scale, left_sigma * right_sigma * scale
-        rows = [
-            [left, both, zero, zero],
-            [zero, zero, left, both],
-            [right, both, zero, zero],
-            [zero, zero, right, both],
+        return [
+            [left, None, None, None],
+            [None, left, None, None],
+            [None, None, right, None],
+            [None, None, None, right],
         ]
-    flat = [entry for row in rows for entry in row]
-    return columns(*flat).unflatten(-1, (4, 4))
+    scale = (left * left + right * right).rsqrt()
+    there, back, both = left * left * scale, -(right * right) * scale, left * right * scale
+    return [
+        [there, both, None, None],
+        [None, None, there, both],
+        [back, both, None, None],
+        [None, None, back, both],
+    ]
 
 
 def observe(
@@ -198,37 +224,66 @@ def observe(
     """
     require(chart in ("inverse_range", "cartesian"), "chart", chart, "inverse_range or cartesian")
     points = points or SigmaPoints()
-    mean = columns(*matches.left_px.unbind(-1), *matches.right_px.unbind(-1))
-    in_front = torch.ones((), dtype=torch.bool)
-    direction = torch.empty(())
+    count = matches.valid.shape[-1]
+    learning = torch.is_grad_enabled() and any(t.requires_grad for t in (*matches[:4], *eyes))
+    if count <= BLOCK or learning or not matches.valid.device.type == "cpu":
+        return _observe(matches, eyes, camera, support_px, points, chart, rotated, right_camera or camera)
+    # nine sigma points of a few thousand receptive fields stay in the processor's cache; of all of them they do not
+    axes = (-2, -2, -1, -1, -1)
+    parts = []
+    for start in range(0, count, BLOCK):
+        size = min(BLOCK, count - start)
+        part = Correspondences(*(t.narrow(axis, start, size) for t, axis in zip(matches, axes, strict=True)))
+        support = support_px.narrow(-1, start, size)
+        parts.append(_observe(part, eyes, camera, support, points, chart, rotated, right_camera or camera))
+    mean, cov, direction, support, valid = zip(*parts, strict=True)
+    return Observations(_join(mean), _join(cov), _join(direction), torch.cat(support, -1), torch.cat(valid, -1))
+
+
+def _join(parts: tuple[Tensor, ...]) -> Tensor:
+    """Join (..., n, k) along n, each component contiguous as `columns` makes it."""
+    return torch.cat([part.movedim(-1, 0) for part in parts], -1).movedim(0, -1)
+
+
+def _observe(
+    matches: Correspondences,
+    eyes: Eyes,
+    camera: Camera,
+    support_px: Tensor,
+    points: SigmaPoints,
+    chart: str,
+    rotated: bool,
+    right_camera: Camera,
+) -> Observations:
     frame, origin, baseline = rig_frame(eyes)
-    to_left, to_right = frame.mT @ eyes.R_left, frame.mT @ eyes.R_right
-
-    def rays(px: Tensor) -> tuple[Tensor, Tensor]:
-        left, right = camera.rays(px[..., :2]), (right_camera or camera).rays(px[..., 2:])
-        return turn(to_left, left), turn(to_right, right)
-
-    def cartesian(px: Tensor) -> Tensor:
-        nonlocal in_front, direction
+    root = _root_rows(matches.left_sigma_px, matches.right_sigma_px, rotated)
+    places = sigma_components((*matches.left_px.unbind(-1), *matches.right_px.unbind(-1)), root, points)
+    left = _turned(frame.mT @ eyes.R_left, camera.ray_components(*places[:2]))
+    right = _turned(frame.mT @ eyes.R_right, right_camera.ray_components(*places[2:]))
+    if chart == "cartesian":
         half = torch.stack([baseline / 2, torch.zeros_like(baseline), torch.zeros_like(baseline)], -1).unsqueeze(-2)
-        point, in_front = triangulate(*rays(px), -half, half)
+        point, both = triangulate(columns(*left), columns(*right), -half, half)
+        in_front = both.all(0)
         point = turn(frame, point) + origin.unsqueeze(-2)
         direction = point[0] * (point[0] * point[0]).sum(-1, keepdim=True).rsqrt()
-        return point
-
-    def inverse_range(px: Tensor) -> Tensor:
-        nonlocal in_front, direction
-        x, w, in_front = triangulate_rectified(*rays(px), baseline.unsqueeze(-1))
-        # the origin of E, seen in the rig's axes: there the sigma points stay, and the few directions come to them
-        shift = turn(frame.mT, origin.unsqueeze(-2))
-        x = torch.addcmul(x, w[..., None], shift)
-        ahead = x[0] * (x[0] * x[0]).sum(-1, keepdim=True).rsqrt()
+        first, second = moments(point.unbind(-1), points)
+    else:
+        x, w, least = _rectified(left, right)
+        in_front = least.amin(0) > 0
+        w = w * (2 / baseline.unsqueeze(-1))
+        # the origin of E joins in the rig's axes: the few directions come to the sigma points, not these to E
+        shift = turn(frame.mT, origin.unsqueeze(-2)).unbind(-1)
+        x = tuple(torch.addcmul(c, w, s) for c, s in zip(x, shift, strict=True))
+        ahead = columns(*(c[0] for c in x))
+        ahead = ahead * (ahead * ahead).sum(-1, keepdim=True).rsqrt()
         direction = turn(frame, ahead)
-        return inverse_range_coordinates(x, w, ahead, tuple(turn(frame.mT, e) for e in basis(direction)))
-
-    root = sigma_root(matches.left_sigma_px, matches.right_sigma_px, rotated)
-    value, cov, _ = unscented_transform(cartesian if chart == "cartesian" else inverse_range, mean, root, points)
-    valid = matches.valid & in_front.all(0) & positive_definite(cov) & torch.isfinite(value).all(-1)
+        tangents = [turn(frame.mT, e).unbind(-1) for e in basis(direction)]
+        # (a, b, ρ) of `torchfovea.chart`, by components
+        depth = 1 / _dot(ahead.unbind(-1), x)
+        offsets = [_dot(e, x) * depth for e in tangents]
+        first, second = moments((*offsets, w * _dot(x, x).rsqrt()), points)
+    value, cov = columns(*first), columns(*second)
+    valid = matches.valid & in_front & positive_definite(cov) & torch.isfinite(value).all(-1)
     safe = columns(*(torch.full_like(valid, float(k in (0, 3, 5)), dtype=cov.dtype) for k in range(6)))
     centre = camera.rays(matches.left_px)
     support = support_px / camera.focal_px * (centre * centre).sum(-1).rsqrt()

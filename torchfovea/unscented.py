@@ -7,7 +7,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,7 +17,7 @@ from torch import Tensor
 from torchfovea.gaussian import columns
 from torchfovea.setting import require
 
-__all__ = ["SigmaPoints", "unscented_transform"]
+__all__ = ["SigmaPoints", "moments", "sigma_components", "unscented_transform"]
 
 
 @dataclass(frozen=True)
@@ -92,32 +92,54 @@ def unscented_transform(
     """
     n = mean.shape[-1]
     require(points.dimensions == n, "sigma_points.dimensions", points.dimensions, f"{n}, the size of the input")
-    step = points.spread * root
-    x = mean.unbind(-1)
-    sigma = columns(
-        *(
-            torch.stack(
-                [x[i], *(x[i] + step[..., i, j] for j in range(n)), *(x[i] - step[..., i, j] for j in range(n))]
-            )
-            for i in range(n)
-        )
-    )
-    image = function(sigma)
-    delta = (image - image[0]).unbind(-1)
+    rows = [[root[..., i, j] for j in range(n)] for i in range(n)]
+    image = function(columns(*sigma_components(mean.unbind(-1), rows, points)))
+    first, second = moments(image.unbind(-1), points)
+    return columns(*first), columns(*second), image
+
+
+def sigma_components(
+    mean: Sequence[Tensor], root: Sequence[Sequence[Tensor | None]], points: SigmaPoints
+) -> list[Tensor]:
+    """The sigma points (Eq. 10-12), component by component: the form that speed wants.
+
+    Args:
+        mean: n components (...).
+        root: rows of the square root, n by n components (...); None is zero.
+        points: their spread.
+
+    Returns:
+        n components (2n+1, ...), the mean itself first. Differentiable.
+    """
+    components = []
+    for centre, row in zip(mean, root, strict=True):
+        steps = [None if entry is None else points.spread * entry for entry in row]
+        plus = [centre if step is None else centre + step for step in steps]
+        minus = [centre if step is None else centre - step for step in steps]
+        components.append(torch.stack([centre, *plus, *minus]))
+    return components
+
+
+def moments(image: Sequence[Tensor], points: SigmaPoints) -> tuple[list[Tensor], list[Tensor]]:
+    """Mean and covariance of the images of the sigma points (Eq. 17-18).
+
+    Args:
+        image: m components (2n+1, ...), the central one first.
+        points: their weights.
+
+    Returns:
+        m components of the mean and m(m+1)/2 of the covariance's upper triangle, row by row, each (...).
+        Differentiable.
+    """
+    # δ₀ = 0 and the other weights are all one w (Eq. 16), for mean and covariance alike: with s = w Σ δ,
+    # Σ w (δ − s)(δ − s)ᵀ = w Σ δ δᵀ + (Σ w_c − 2) s sᵀ, the sum of the weights including the centre's
     weights_mean, weights_cov = points.weights
-    w = torch.tensor(weights_mean, dtype=mean.dtype, device=mean.device)
-    shift = [torch.tensordot(w, d, 1) for d in delta]
-    total = sum(weights_cov)
-    w = torch.tensor(weights_cov, dtype=mean.dtype, device=mean.device)
-    m = len(delta)
-    packed = []
-    for i in range(m):
-        weighted = w.reshape(-1, *(1,) * (delta[i].dim() - 1)) * delta[i]
-        first = weighted.sum(0)
-        for j in range(i, m):
-            # Σ w (δi − si)(δj − sj) = Σ w δi δj − sj Σ w δi − si Σ w δj + si sj Σ w
-            other = first if j == i else torch.tensordot(w, delta[j], 1)
-            packed.append(
-                (weighted * delta[j]).sum(0) - shift[j] * first - shift[i] * other + total * shift[i] * shift[j]
-            )
-    return image[0] + columns(*shift), columns(*packed), image
+    weight, rest = weights_mean[1], sum(weights_cov) - 2
+    delta = [component[1:] - component[0] for component in image]
+    shift = [weight * component.sum(0) for component in delta]
+    second = [
+        torch.addcmul(weight * (delta[i] * delta[j]).sum(0), shift[i], shift[j], value=rest)
+        for i in range(len(delta))
+        for j in range(i, len(delta))
+    ]
+    return [component[0] + s for component, s in zip(image, shift, strict=True)], second
