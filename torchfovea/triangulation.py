@@ -11,7 +11,8 @@ from torchfovea.camera import Camera
 from torchfovea.chart import basis
 from torchfovea.correspondence import Correspondences
 from torchfovea.gaussian import columns, positive_definite
-from torchfovea.head import Eyes, to_ego as turn
+from torchfovea.head import Eyes
+from torchfovea.head import to_ego as turn
 from torchfovea.setting import require
 from torchfovea.unscented import SigmaPoints, moments, sigma_components
 
@@ -93,7 +94,7 @@ def triangulate_rectified(left: Tensor, right: Tensor, baseline_m: Tensor) -> tu
 
         X = b/2 (x z' + x' z, y z' + y' z, 2 z z'),   w = x z' − x' z.
 
-    It is `triangulate` where the rays meet. Where noise keeps them apart it leaves the vertical mismatch out of the depth
+    It is `triangulate` where the rays meet. Where noise keeps them apart it leaves the vertical mismatch out of it
     (which is what the likelihood of isotropic noise on a rectified pair says), and numerator and denominator keep their
     signs through parallel rays, where the shortest segment between skew rays would jump toward the eyes.
 
@@ -103,8 +104,8 @@ def triangulate_rectified(left: Tensor, right: Tensor, baseline_m: Tensor) -> tu
         baseline_m: broadcastable to (...).
 
     Returns:
-        X (..., 3) and w (...), the point being X/w about the baseline's middle (w < 0 beyond infinity), and whether both
-        rays look ahead: bool (...). Where they do not, X and w are finite and meaningless.
+        X (..., 3) and w (...), the point being X/w about the baseline's middle (w < 0 beyond infinity), and whether
+        both rays look ahead: bool (...). Where they do not, X and w are finite and meaningless.
 
     Differentiable.
     """
