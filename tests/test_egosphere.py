@@ -320,7 +320,9 @@ def test_bad_observations_are_left_out(name, fault):
 
 def test_no_observations_at_all():
     cells = fibonacci_directions(10)
-    none = Observations(torch.zeros(0, 3), torch.zeros(0, 6), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, dtype=bool))
+    none = Observations(
+        torch.zeros(0, 3), torch.zeros(0, 6), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, dtype=bool)
+    )
     assert enter(cells, none, Fusion()).looks.sum() == 0
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -76,13 +77,19 @@ def associate(
         return Pairs(pair, cell)
     empty = torch.ones(batch * count, dtype=torch.bool, device=cells.device)
     empty[cell] = False
-    direction = torch.where(good[..., None], observed.direction.detach(), torch.zeros_like(observed.direction))
-    nearest, cosine = nearest_observation(direction, cells)
-    angle = torch.acos(cosine.clamp(-1, 1))
-    gate = observed.support_rad.expand_as(good).gather(-1, nearest).clamp(min=gate_rad)
-    filled = empty & ((angle <= gate) & good.gather(-1, nearest)).reshape(-1)
-    extra = filled.nonzero().squeeze(1)
+    support = observed.support_rad.expand(good.shape)
+    widest = max(gate_rad, float(torch.where(good, support, torch.zeros_like(support)).max()))
+    if widest == 0:
+        return Pairs(pair, cell)
+    counted = torch.where(good[..., None], observed.direction.detach(), torch.zeros_like(observed.direction))
+    nearest, cosine = nearest_observation(counted, cells, gate_rad=widest, wanted=empty.view(cells.shape[:-1]))
+    extra = (empty & (cosine.reshape(-1) > -1)).nonzero().squeeze(1)
     source = (nearest.reshape(batch, count) + offset * size).reshape(-1).index_select(0, extra)
+    # the observation's own gate, not the widest one's
+    apart = gather_columns(observed.direction, source) - gather_columns(cells, extra)
+    chord = 2 * torch.sin(support.reshape(-1).index_select(0, source).clamp(gate_rad, math.pi) / 2)
+    within = ((apart * apart).sum(-1) <= chord * chord).nonzero().squeeze(1)
+    source, extra = source.index_select(0, within), extra.index_select(0, within)
     return Pairs(torch.cat([pair, source]), torch.cat([cell, extra]))
 
 

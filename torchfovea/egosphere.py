@@ -126,16 +126,20 @@ class Fusion:
         return "inverse_range" if self.name == "inverse_range" else "cartesian"
 
 
+def _prior_scalars(cells: Tensor, prior: Prior, chart: str) -> tuple[list[tuple[Tensor | float, float]], float]:
+    """The prior's information vector and diagonal matrix, axis by axis, and its bearing precision."""
+    weight, slope = prior.std**-2, prior.slope_std**-2
+    if chart == "cartesian":
+        return [(prior.mean * weight * c, weight) for c in cells.unbind(-1)], 0.0
+    return [(0.0, slope), (0.0, slope), (prior.mean * weight, weight)], prior.bearing_std**-2
+
+
 def prior_information(cells: Tensor, prior: Prior, chart: str = "inverse_range") -> tuple[Information, Tensor]:
     """What every cell believes at first, and its bearing precision, in the shapes of `EgoSphere`."""
     zero = torch.zeros_like(cells[..., 0])
-    weight = torch.full_like(zero, prior.std**-2)
-    if chart == "cartesian":
-        matrix = columns(weight, zero, zero, weight, zero, weight)
-        return Information(columns(*(prior.mean * weight * c for c in cells.unbind(-1))), matrix), zero
-    slope = torch.full_like(zero, prior.slope_std**-2)
-    information = Information(columns(zero, zero, prior.mean * weight), columns(slope, zero, zero, slope, zero, weight))
-    return information, torch.full_like(zero, prior.bearing_std**-2)
+    ((x, xx), (y, yy), (z, zz)), bearing = _prior_scalars(cells, prior, chart)
+    matrix = columns(zero + xx, zero, zero, zero + yy, zero, zero + zz)
+    return Information(columns(zero + x, zero + y, zero + z), matrix), zero + bearing
 
 
 def new_egosphere(cells: Tensor, prior: Prior, chart: str = "inverse_range") -> EgoSphere:
@@ -167,30 +171,29 @@ def settle(memory: EgoSphere, pooled: Pooled, fusion: Fusion, prior: Prior) -> t
 
     Differentiable; which is nearer is held fixed.
     """
-    first, bearing = prior_information(memory.cells, prior)
     seen = (memory.looks > 0) & (pooled.count > 0)
-    slope, flat = prior.slope_std**-2, torch.zeros_like(bearing)
-    weak = torch.where(seen, flat, torch.ones_like(flat))
-    matrix = pooled.information.matrix + columns(flat + slope, flat, flat, flat + slope, flat, weak)
     with torch.no_grad():
-        new, new_variance = nearness(Information(pooled.information.vector, matrix))
+        new, new_variance = nearness(pooled.information, prior.slope_std**-2, (~seen).to(memory.looks.dtype))
         old, old_variance = nearness(memory.information)
         apart = (new - old) * (new_variance + old_variance).rsqrt()
         nearer, farther = seen & (apart > fusion.conflict), seen & (apart < -fusion.conflict)
-        keep = torch.where(nearer, flat, torch.where(farther, flat + fusion.erode, flat + 1))
-    memory = _blend(memory, first, bearing, keep)
-    take = (~farther).to(flat.dtype)
+        keep = torch.where(farther, fusion.erode, (~nearer).to(apart.dtype))
+        take = (~farther).to(apart.dtype)
+    memory = _blend(memory, prior, "inverse_range", keep)
     information = Information(*(take[..., None] * part for part in pooled.information))
     return memory, Pooled(information, take * pooled.bearing, take * pooled.count)
 
 
-def _blend(memory: EgoSphere, first: Information, bearing: Tensor, keep: Tensor) -> EgoSphere:
+def _blend(memory: EgoSphere, prior: Prior, chart: str, keep: Tensor) -> EgoSphere:
     """Keep a share (..., Nx) of what was learned; the rest is the prior's."""
-    weight = keep[..., None]
-    information = Information(
-        *(then + weight * (now - then) for now, then in zip(memory.information, first, strict=True))
-    )
-    return memory._replace(information=information, bearing=bearing + keep * (memory.bearing - bearing))
+    first, bearing = _prior_scalars(memory.cells, prior, chart)
+    less = 1 - keep
+    vector, matrix = ([keep * part for part in parts.unbind(-1)] for parts in memory.information)
+    for k, (mean, weight) in enumerate(first):
+        vector[k] = vector[k] + less * mean
+        matrix[(0, 3, 5)[k]] = matrix[(0, 3, 5)[k]] + less * weight
+    information = Information(columns(*vector), columns(*matrix))
+    return memory._replace(information=information, bearing=keep * memory.bearing + less * bearing)
 
 
 def forget(memory: EgoSphere, prior: Prior, chart: str, keep: float | Tensor) -> EgoSphere:
@@ -206,7 +209,7 @@ def forget(memory: EgoSphere, prior: Prior, chart: str, keep: float | Tensor) ->
     """
     share = torch.as_tensor(keep, dtype=memory.cells.dtype, device=memory.cells.device)
     require(bool(((share >= 0) & (share <= 1)).all()), "keep", keep, "a share from 0 to 1")
-    return _blend(memory, *prior_information(memory.cells, prior, chart), share.expand(memory.looks.shape))
+    return _blend(memory, prior, chart, share.expand(memory.looks.shape))
 
 
 def fuse(memory: EgoSphere, pooled: Pooled) -> EgoSphere:

@@ -116,14 +116,23 @@ def add_common(pooled: Pooled, common: Tensor, chart: str, slope_std: float = 0.
     return pooled._replace(information=information, bearing=bearing)
 
 
-def nearness(information: Information) -> tuple[Tensor, Tensor]:
-    """Mean and variance (...) of patches' inverse range at their cells, from their information. Differentiable."""
+def nearness(information: Information, slope: float = 0.0, weak: Tensor | float = 0.0) -> tuple[Tensor, Tensor]:
+    """Mean and variance (...) of patches' inverse range at their cells, from their information.
+
+    Args:
+        information: of patches (g₁, g₂, ρ), (..., 3) and (..., 6).
+        slope: information of each slope to add, which pooled observations may lack.
+        weak: the same of ρ, so that empty cells have finite moments too; broadcastable to (...).
+
+    Differentiable.
+    """
     x, y, z = information.vector.unbind(-1)
     xx, xy, xz, yy, yz, zz = information.matrix.unbind(-1)
-    det = xx * yy - xy * xy
+    xx, yy = xx + slope, yy + slope
+    scale = 1 / (xx * yy - xy * xy)
     # the row (xz, yz) times the inverse of the slopes' block
-    a, b = (xz * yy - yz * xy) / det, (yz * xx - xz * xy) / det
-    variance = 1 / (zz - a * xz - b * yz)
+    a, b = scale * (xz * yy - yz * xy), scale * (yz * xx - xz * xy)
+    variance = 1 / (zz + weak - a * xz - b * yz)
     return variance * (z - a * x - b * y), variance
 
 
@@ -135,7 +144,5 @@ def found_points(pooled: Pooled, cells: Tensor, chart: str, slope_std: float, fa
     if chart == "cartesian":
         safe = torch.where(seen[..., None], matrix, columns(one, zero, zero, one, zero, one))
         return torch.where(seen[..., None], times3(inverse3(safe), vector), cells)
-    slope = one * slope_std**-2
-    matrix = matrix + columns(slope, zero, zero, slope, zero, torch.where(seen, zero, one))
-    rho = torch.where(seen, nearness(Information(vector, matrix))[0], one)
+    rho = torch.where(seen, nearness(pooled.information, slope_std**-2, torch.where(seen, zero, one))[0], one)
     return cells / rho.clamp(min=1 / far_m)[..., None]
