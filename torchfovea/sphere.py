@@ -1,4 +1,4 @@
-"""Directions of the sensory ego-sphere: the biased random topology of Eq. 20-21 and the regular ones of Fig. 4.
+"""Directions of the sensory ego-sphere: the biased random topology of Eq. 20-21.
 
 A cell is p = v/|v| with v drawn from a mixture of Gaussians. Its density on the sphere, the projected normal mixture,
 has a closed form, so that a bias can be tuned by gradient: in the mixture weights, the means and the Cholesky factors.
@@ -6,21 +6,27 @@ has a closed form, so that a bias can be tuned by gradient: in the mixture weigh
 References:
     Pukkila, Rao (1988), Pattern recognition based on scale invariant discriminant functions, Information Sciences 45.
     Muller (1959), A note on a method for generating points uniformly on n-dimensional spheres, Comm. ACM 2(4).
-    Goldberg (1937), A class of multi-symmetric polyhedra, Tohoku Mathematical Journal 43.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
-from scipy.spatial import ConvexHull
 from torch import Tensor
 
 from torchfovea.setting import SettingError, require
+from torchfovea.topology import (
+    Reachable,
+    ask,
+    fibonacci_directions,
+    geodesic_directions,
+    latitude_longitude_directions,
+    reachable_directions,
+    truncated_icosahedron_directions,
+)
 
 __all__ = [
     "DirectionMixture",
@@ -38,9 +44,6 @@ __all__ = [
     "sphere_quadrature",
     "truncated_icosahedron_directions",
 ]
-
-Reachable = Callable[[Tensor], Tensor]
-"""Predicate of a set of directions: unit vectors (n, 3) to bool (n,)."""
 
 _LOG_2PI = math.log(2 * math.pi)
 _FEWEST_ACCEPTED = 1e-4  # share of proposals below which restricted sampling gives up
@@ -241,7 +244,7 @@ def sphere_quadrature(
     """
     directions = fibonacci_directions(n, dtype, device)
     if reachable is not None:
-        directions = directions[_ask(reachable, directions)]
+        directions = directions[ask(reachable, directions)]
         require(len(directions) > 0, "reachable", "no direction", f"at least one of {n} directions of the sphere")
     return Quadrature(directions, directions.new_full((len(directions),), 4 * math.pi / n))
 
@@ -268,8 +271,7 @@ def sample(
         SettingError: if n < 1, or if fewer than one draw in 10,000 is reachable.
     """
     require(n >= 1, "cells", n, "at least 1")
-    if isinstance(generator, int):
-        generator = torch.Generator().manual_seed(generator)
+    generator = torch.Generator().manual_seed(generator) if isinstance(generator, int) else generator
     weights = mixture.logits.detach().softmax(-1).to(generator.device)
     mean, factor = mixture.means.detach(), mixture.cholesky.detach()
     kept: list[tuple[Tensor, Tensor]] = []
@@ -283,7 +285,7 @@ def sample(
         v = mean[component] + (factor[component] @ noise.unsqueeze(-1)).squeeze(-1)
         good = v.abs().amax(-1) > 0
         if reachable is not None:
-            good = good & _ask(reachable, torch.nn.functional.normalize(v, dim=-1))
+            good = good & ask(reachable, torch.nn.functional.normalize(v, dim=-1))
         kept.append((component[good], noise[good]))
         accepted += len(kept[-1][0])
         proposed += count
@@ -316,114 +318,3 @@ def _unit(directions: Tensor) -> Tensor:
     require(bool(((largest > 0) & (largest < math.inf)).all()), "directions", "zero or not finite", "non-zero vectors")
     scaled = directions / largest  # so that no square under- or overflows
     return scaled / scaled.square().sum(-1, keepdim=True).sqrt()
-
-
-def _ask(reachable: Reachable, directions: Tensor) -> Tensor:
-    answer = reachable(directions)
-    n = len(directions)
-    good = answer.dtype == torch.bool and answer.shape == (n,)
-    require(good, "reachable", f"{answer.dtype} {tuple(answer.shape)}", f"a predicate that returns bool ({n},)")
-    return answer
-
-
-def fibonacci_directions(n: int, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Tensor:
-    """Spherical Fibonacci lattice: n directions, each with nearly the same share of the sphere.
-
-    Args:
-        n: how many, exactly.
-        dtype: default torch's.
-        device: default torch's.
-    """
-    require(n >= 1, "n", n, "at least 1")
-    i = torch.arange(n, dtype=torch.float64)
-    z = 1 - (2 * i + 1) / n
-    azimuth = i * (math.pi * (3 - math.sqrt(5)))
-    r = (1 - z * z).sqrt()
-    return torch.stack((r * azimuth.cos(), r * azimuth.sin(), z), -1).to(device, dtype or torch.get_default_dtype())
-
-
-def latitude_longitude_directions(
-    n: int, dtype: torch.dtype | None = None, device: torch.device | str | None = None
-) -> Tensor:
-    """The 2-D array of Fig. 4a: rows of latitude, twice as many columns of longitude, denser toward the poles.
-
-    Args:
-        n: about how many; the result has 2 rows² directions.
-        dtype: default torch's.
-        device: default torch's.
-    """
-    require(n >= 1, "n", n, "at least 1")
-    rows = max(1, round(math.sqrt(n / 2)))
-    latitude = ((torch.arange(rows, dtype=torch.float64) + 0.5) / rows - 0.5).mul(math.pi)[:, None]
-    longitude = (torch.arange(2 * rows, dtype=torch.float64) + 0.5).mul(math.pi / rows)
-    x, y, z = torch.broadcast_tensors(
-        latitude.cos() * longitude.cos(), latitude.cos() * longitude.sin(), latitude.sin()
-    )
-    return torch.stack((x, y, z), -1).flatten(0, 1).to(device, dtype or torch.get_default_dtype())
-
-
-def geodesic_directions(n: int, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Tensor:
-    """The geodesic dome of Fig. 4b: vertices of an icosahedron whose faces are divided b times.
-
-    Args:
-        n: about how many; the result has 10 b² + 2 directions.
-        dtype: default torch's.
-        device: default torch's.
-    """
-    require(n >= 1, "n", n, "at least 1")
-    return _divide(_icosahedron(), round(math.sqrt(max(n - 2, 0) / 10))).to(device, dtype or torch.get_default_dtype())
-
-
-def truncated_icosahedron_directions(
-    n: int = 32, dtype: torch.dtype | None = None, device: torch.device | str | None = None
-) -> Tensor:
-    """The truncated icosahedron of Fig. 4c: its 12 pentagons and 20 hexagons are the cells, and finer ones divide them.
-
-    Args:
-        n: about how many; the result has 30 b² + 2 directions (Goldberg's polyhedra of class (b, b)), 32 for b = 1.
-        dtype: default torch's.
-        device: default torch's.
-    """
-    require(n >= 1, "n", n, "at least 1")
-    corners = _icosahedron()
-    faces = corners[ConvexHull(corners).simplices].sum(1)
-    cells = np.concatenate((corners, faces / np.linalg.norm(faces, axis=-1, keepdims=True)))
-    return _divide(cells, round(math.sqrt(max(n - 2, 0) / 30))).to(device, dtype or torch.get_default_dtype())
-
-
-def reachable_directions(topology: Callable[[int], Tensor], n: int, reachable: Reachable) -> Tensor:
-    """A regular topology made so dense that about n of its directions are reachable; returns those.
-
-    Args:
-        topology: such as `geodesic_directions`, called with a number of directions on the whole sphere.
-        n: how many reachable ones to aim at (a regular topology comes in steps).
-        reachable: predicate of the reachable set.
-
-    Raises:
-        SettingError: where the reachable set is empty or smaller than 1/100,000 of the sphere.
-    """
-    probe = 100_000
-    share = int(_ask(reachable, fibonacci_directions(probe)).sum()) / probe
-    require(share > 0, "reachable", "no direction", f"at least one of {probe} directions of the sphere")
-    for _ in range(3):  # a topology need not be equally dense everywhere
-        directions = topology(max(1, round(n / share)))
-        reached = directions[_ask(reachable, directions)]
-        share = max(len(reached), 1) / len(directions)
-    return reached
-
-
-def _icosahedron() -> np.ndarray:
-    golden = (1 + math.sqrt(5)) / 2
-    corners = [np.roll((0.0, i, j * golden), k) for i in (-1, 1) for j in (-1, 1) for k in range(3)]
-    return np.stack(corners) / math.hypot(1, golden)
-
-
-def _divide(vertices: np.ndarray, times: int) -> Tensor:
-    """Vertices of a convex polyhedron with triangular faces after each edge is divided `times` (at least 1)."""
-    times = max(times, 1)
-    i, j = np.meshgrid(np.arange(times + 1), np.arange(times + 1))
-    weights = np.stack((i, j, times - i - j), -1)[i + j <= times] / times
-    points = np.einsum("wk,fkx->fwx", weights, vertices[ConvexHull(vertices).simplices]).reshape(-1, 3)
-    points /= np.linalg.norm(points, axis=-1, keepdims=True)
-    _, first = np.unique(np.round(points, 9) + 0.0, axis=0, return_index=True)  # faces share their edges
-    return torch.from_numpy(points[np.sort(first)])
