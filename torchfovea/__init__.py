@@ -1,3 +1,66 @@
-"""Active foveal stereo: where to look next, and how well each glance is known."""
+"""Active foveal stereo in PyTorch: where to look next, and how well each glance is known.
+
+The names below are the library; each lives in a module of its own, documented there. Importing the package loads neither
+MuJoCo nor Hydra nor matplotlib nor OpenCV.
+"""
+
+from torchfovea.acquisition import choose, expected_improvement, log_expected_improvement, upper_confidence_bound
+from torchfovea.camera import Fisheye, Pinhole
+from torchfovea.correspondence import Budget, Correspondences
+from torchfovea.egosphere import EgoSphere, Fusion, Prior, belief, cartesian_belief, new_egosphere, remember
+from torchfovea.gaussian import Gaussian, Information
+from torchfovea.head import Eyes, Gaze, Head, cyclopean, eyes, fixate
+from torchfovea.layout import LogPolar, Uniform
+from torchfovea.perception import Eligibility, Observer, decide, new_mind, perceive
+from torchfovea.retina import fovea, reconstruct
+from torchfovea.setting import SettingError
+from torchfovea.sphere import DirectionMixture, direction_mixture, log_density, sample
+from torchfovea.triangulation import Observations, observe, triangulate
+from torchfovea.unscented import SigmaPoints, unscented_transform
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "Budget",
+    "Correspondences",
+    "DirectionMixture",
+    "EgoSphere",
+    "Eligibility",
+    "Eyes",
+    "Fisheye",
+    "Fusion",
+    "Gaussian",
+    "Gaze",
+    "Head",
+    "Information",
+    "LogPolar",
+    "Observations",
+    "Observer",
+    "Pinhole",
+    "Prior",
+    "SettingError",
+    "SigmaPoints",
+    "Uniform",
+    "belief",
+    "cartesian_belief",
+    "choose",
+    "cyclopean",
+    "decide",
+    "direction_mixture",
+    "expected_improvement",
+    "eyes",
+    "fixate",
+    "fovea",
+    "log_density",
+    "log_expected_improvement",
+    "new_egosphere",
+    "new_mind",
+    "observe",
+    "perceive",
+    "reconstruct",
+    "remember",
+    "sample",
+    "triangulate",
+    "unscented_transform",
+    "upper_confidence_bound",
+]
