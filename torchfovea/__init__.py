@@ -1,6 +1,6 @@
 """Active foveal stereo in PyTorch: where to look next, and how well each glance is known.
 
-The names below are the library; each lives in a module of its own, documented there. Importing the package loads neither
+The names below are the library; each is documented in the module it comes from. Importing the package loads neither
 MuJoCo nor Hydra nor matplotlib nor OpenCV.
 """
 
