@@ -21,15 +21,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchfovea.association import Pairs, associate, gather_columns, in_front
-from torchfovea.chart import basis, turn_cartesian
+from torchfovea.association import associate, gather_columns
+from torchfovea.chart import turn_cartesian
 from torchfovea.gaussian import Gaussian, Information, columns, gaussian_from_information
 from torchfovea.nearest import CellIndex
-from torchfovea.pooling import Pooled, add_common, found_points, nearness, pool, pool_patches
+from torchfovea.pooling import Pooled, add_common, found_points, nearness, pool, pool_in_front
 from torchfovea.setting import require
 from torchfovea.triangulation import Observations
 
 __all__ = [
+    "Common",
     "EgoSphere",
     "Fusion",
     "Prior",
@@ -43,6 +44,10 @@ __all__ = [
     "remember",
     "settle",
 ]
+
+
+Common = Tensor | Callable[[Tensor], Tensor]
+"""Packed covariance (..., Nx, 6) that a saccade's observations share, or a function of their points (..., Nx, 3)."""
 
 
 class EgoSphere(NamedTuple):
@@ -171,7 +176,7 @@ def settle(memory: EgoSphere, pooled: Pooled, fusion: Fusion, prior: Prior) -> t
 
     Differentiable; which is nearer is held fixed.
     """
-    seen = (memory.looks > 0) & (pooled.count > 0)
+    seen = (memory.looks > 0) & (pooled.hits > 0)
     with torch.no_grad():
         new, new_variance = nearness(pooled.information, prior.slope_std**-2, (~seen).to(memory.looks.dtype))
         old, old_variance = nearness(memory.information)
@@ -181,7 +186,7 @@ def settle(memory: EgoSphere, pooled: Pooled, fusion: Fusion, prior: Prior) -> t
         take = (~farther).to(apart.dtype)
     memory = _blend(memory, prior, "inverse_range", keep)
     information = Information(*(take[..., None] * part for part in pooled.information))
-    return memory, Pooled(information, take * pooled.bearing, take * pooled.count)
+    return memory, Pooled(information, take * pooled.bearing, take * pooled.hits)
 
 
 def _blend(memory: EgoSphere, prior: Prior, chart: str, keep: Tensor) -> EgoSphere:
@@ -215,7 +220,7 @@ def forget(memory: EgoSphere, prior: Prior, chart: str, keep: float | Tensor) ->
 def fuse(memory: EgoSphere, pooled: Pooled) -> EgoSphere:
     """Join one saccade's pooled observations with the memory (Eq. 34-35). Differentiable."""
     information = Information(*(old + new for old, new in zip(memory.information, pooled.information, strict=True)))
-    return EgoSphere(memory.cells, information, memory.bearing + pooled.bearing, memory.looks + (pooled.count > 0))
+    return EgoSphere(memory.cells, information, memory.bearing + pooled.bearing, memory.looks + (pooled.hits > 0))
 
 
 def remember(
@@ -225,7 +230,7 @@ def remember(
     observed: Observations,
     fusion: Fusion,
     prior: Prior,
-    common: Tensor | Callable[[Tensor], Tensor] | None = None,
+    common: Common | None = None,
 ) -> EgoSphere:
     """Enter one saccade's observations: associate (Eq. 22-23), pool, add, fuse (Eq. 34-35).
 
@@ -236,8 +241,7 @@ def remember(
         observed: in the fusion's chart; see `associate` for what is left out.
         fusion: how.
         prior: what the memory began with.
-        common: packed covariance (..., Nx, 6) that the saccade's observations share, see `add_common`; or a function
-            that gives it for the points (..., Nx, 3) which the saccade found, see `torchfovea.encoders`.
+        common: see `add_common`; a function of the points that the saccade found, see `torchfovea.encoders`.
 
     Returns:
         The ego-sphere after. Differentiable in the observations (the association is held fixed).
@@ -255,7 +259,7 @@ def remember(
             gaussian = turn_cartesian(gaussian, direction, target)
         pooled = pool(gaussian, pairs.cell, batch, cells.shape[-2])
     else:
-        pooled = _pool_in_front(observed, direction, target, pairs, cells, fusion, prior)
+        pooled = pool_in_front(observed, direction, target, pairs, cells, fusion.conflict, prior.slope_std)
     if common is not None:
         if callable(common):
             common = common(found_points(pooled, cells, chart, prior.slope_std))
@@ -263,26 +267,6 @@ def remember(
     if chart == "inverse_range" and fusion.conflict < math.inf:
         memory, pooled = settle(memory, pooled, fusion, prior)
     return fuse(memory, pooled)
-
-
-def _pool_in_front(
-    observed: Observations, direction: Tensor, target: Tensor, pairs: Pairs, cells: Tensor, fusion: Fusion, prior: Prior
-) -> Pooled:
-    """Pool inverse ranges, without those that another of the same cell hides from E."""
-    aa, _, _, bb, _, rr = (part.reshape(-1).index_select(0, pairs.observation) for part in observed.cov.unbind(-1))
-    rho = observed.mean[..., 2].reshape(-1).index_select(0, pairs.observation)
-    across = aa + bb
-    # seen in a direction that is itself uncertain: on a slope the inverse range is so too
-    variance = rr + prior.slope_std**2 * across
-    row = columns(*((direction * axis).sum(-1) for axis in (*basis(target), target)))
-    batch, count = cells.shape[:-2], cells.shape[-2]
-    keep = torch.ones_like(rho)
-    if fusion.conflict < math.inf:
-        with torch.no_grad():
-            off = row[..., 0] ** 2 + row[..., 1] ** 2
-            std = (variance + prior.slope_std**2 * off).sqrt()
-            keep = in_front(rho, std, pairs.cell, batch.numel() * count, fusion.conflict).to(rho.dtype)
-    return pool_patches(rho, variance, 2 / across, row, keep, pairs.cell, batch, count)
 
 
 def belief(memory: EgoSphere) -> Gaussian:

@@ -63,6 +63,7 @@ class Head:
         tilt_up_deg: neck tilt upward.
         tilt_down_deg: neck tilt downward.
         vergence_max_deg: largest angle between the optical axes.
+        encoder_deg: standard deviation of what the encoders tell of pan, tilt and vergence.
     """
 
     baseline_m: float = 0.204
@@ -73,6 +74,7 @@ class Head:
     tilt_up_deg: float = 18.0
     tilt_down_deg: float = 37.0
     vergence_max_deg: float = 40.0
+    encoder_deg: float = 0.0
 
     def __post_init__(self) -> None:
         """Raise SettingError for a head that cannot exist."""
@@ -86,6 +88,7 @@ class Head:
         require(
             0 < self.vergence_max_deg < 180, "head.vergence_max_deg", self.vergence_max_deg, "between 0 and 180 degrees"
         )
+        require(0 <= self.encoder_deg < 10, "head.encoder_deg", self.encoder_deg, "from 0 to less than 10 degrees")
         for name in ("eyes_forward_m", "eyes_up_m", "ego_height_m"):
             require(
                 math.isfinite(getattr(self, name)), f"head.{name}", getattr(self, name), "a finite length in metres"

@@ -93,7 +93,8 @@ class _Moved(NamedTuple):
 
 def _carry(memory: EgoSphere, step: Motion, chart: str) -> _Moved:
     """Move what was seen; patches whose back the robot would see now are dropped. Float64: planes mix scales."""
-    moments = belief(EgoSphere(*(_double(part) for part in memory)))
+    information = Information(*(part.double() for part in memory.information))
+    moments = belief(memory._replace(information=information))
     rotation = step.rotation.mT.to(memory.cells.device)
     shift, noise = step.translation.to(memory.cells.device), step.covariance.to(memory.cells.device)
     seen = memory.looks > 0
@@ -129,10 +130,6 @@ def _carry(memory: EgoSphere, step: Motion, chart: str) -> _Moved:
     state = Gaussian(state.mean, state.cov + drift)
     good = facing & (square > 1e-6) & torch.isfinite(state.cov).all(-1) & torch.isfinite(state.mean).all(-1)
     return _Moved(Gaussian(state.mean[good], state.cov[good]), direction[good], bearing[good], looks[good])
-
-
-def _double(part: Tensor | Information) -> Tensor | Information:
-    return Information(*(p.double() for p in part)) if isinstance(part, Information) else part.double()
 
 
 def move(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -12,7 +13,17 @@ from torch import Tensor
 from torchfovea.acquisition import Generators, choose
 from torchfovea.camera import Camera, Pinhole
 from torchfovea.correspondence import Budget, Correspondences
-from torchfovea.egosphere import EgoSphere, Fusion, Prior, belief, cartesian_from_patches, new_egosphere, remember
+from torchfovea.egosphere import (
+    Common,
+    EgoSphere,
+    Fusion,
+    Prior,
+    belief,
+    cartesian_from_patches,
+    new_egosphere,
+    remember,
+)
+from torchfovea.encoders import encoder_covariance
 from torchfovea.gaussian import Gaussian
 from torchfovea.head import Eyes, Gaze, Head, cyclopean, fixate
 from torchfovea.layout import LogPolar, Retina
@@ -121,7 +132,7 @@ def new_mind(observer: Observer, cells: Tensor) -> Mind:
 
 
 def perceive(
-    observer: Observer, mind: Mind, matches: Correspondences, eyes: Eyes, common: Tensor | None = None
+    observer: Observer, mind: Mind, matches: Correspondences, eyes: Eyes, common: Common | None = None
 ) -> Mind:
     """Enter one saccade's correspondences into the memory.
 
@@ -130,7 +141,8 @@ def perceive(
         mind: before.
         matches: the saccade's correspondences (..., N).
         eyes: where the eyes were.
-        common: see `torchfovea.egosphere.fuse`.
+        common: what the receptive fields' errors share, see `torchfovea.egosphere.remember`; by default what the
+            head's encoders get wrong.
 
     Differentiable in the correspondences. Where only some of the receptive fields were looked through, each stands for
     as many more as are missing and covers a wider patch.
@@ -140,6 +152,9 @@ def perceive(
     observed = observe(
         matches, eyes, observer.camera, support, observer.points, observer.fusion.chart, observer.rotated
     )
+    sigma = math.radians(observer.head.encoder_deg)
+    if common is None and sigma > 0:
+        common = partial(encoder_covariance, eyes=eyes, sigma_rad=(sigma,) * 3, chart=observer.fusion.chart)
     memory = remember(mind.memory, mind.lookup, mind.spacing_rad, observed, observer.fusion, observer.prior, common)
     return mind._replace(memory=memory)
 

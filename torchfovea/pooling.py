@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from torchfovea.association import Pairs, in_front
+from torchfovea.chart import basis
 from torchfovea.gaussian import Gaussian, Information, columns, information_from_gaussian, inverse3, times3
+from torchfovea.triangulation import Observations
 
-__all__ = ["Pooled", "add_common", "found_points", "nearness", "pool", "pool_patches"]
+__all__ = ["Pooled", "add_common", "found_points", "nearness", "pool", "pool_in_front", "pool_patches"]
 
 
 class Pooled(NamedTuple):
@@ -18,12 +22,12 @@ class Pooled(NamedTuple):
     Attributes:
         information: (..., Nx, 3) and (..., Nx, 6), zero where nothing came.
         bearing: see `EgoSphere`, (..., Nx).
-        count: number of observations (..., Nx).
+        hits: number of observations (..., Nx).
     """
 
     information: Information
     bearing: Tensor
-    count: Tensor
+    hits: Tensor
 
 
 def _sum_up(parts: list[Tensor], cell: Tensor, batch: torch.Size, cells: int) -> Pooled:
@@ -83,6 +87,44 @@ def pool_patches(
     return _sum_up([*parts, keep], cell, batch, cells)
 
 
+def pool_in_front(
+    observed: Observations,
+    direction: Tensor,
+    target: Tensor,
+    pairs: Pairs,
+    cells: Tensor,
+    conflict: float,
+    slope_std: float,
+) -> Pooled:
+    """Pool one saccade's inverse ranges, without those that another of the same cell hides from E.
+
+    Args:
+        observed: (..., N), in inverse range.
+        direction: of the observations in pairs (M, 3).
+        target: their cells' directions (M, 3).
+        pairs: from `torchfovea.association.associate`.
+        cells: of the memory (..., Nx, 3).
+        conflict: how many standard deviations apart two surfaces are two; inf: all count.
+        slope_std: how steep patches may be [1/m/rad].
+
+    Differentiable in the observations; which are hidden is held fixed.
+    """
+    aa, _, _, bb, _, rr = (part.reshape(-1).index_select(0, pairs.observation) for part in observed.cov.unbind(-1))
+    rho = observed.mean[..., 2].reshape(-1).index_select(0, pairs.observation)
+    across = aa + bb
+    # seen in a direction that is itself uncertain: on a slope the inverse range is so too
+    variance = rr + slope_std**2 * across
+    row = columns(*((direction * axis).sum(-1) for axis in (*basis(target), target)))
+    batch, count = cells.shape[:-2], cells.shape[-2]
+    keep = torch.ones_like(rho)
+    if conflict < math.inf:
+        with torch.no_grad():
+            off = row[..., 0] ** 2 + row[..., 1] ** 2
+            std = (variance + slope_std**2 * off).sqrt()
+            keep = in_front(rho, std, pairs.cell, batch.numel() * count, conflict).to(rho.dtype)
+    return pool_patches(rho, variance, 2 / across, row, keep, pairs.cell, batch, count)
+
+
 def add_common(pooled: Pooled, common: Tensor, chart: str, slope_std: float = 0.0) -> Pooled:
     """Add a covariance that all observations of the saccade share (encoder errors) to the pooled one.
 
@@ -94,10 +136,10 @@ def add_common(pooled: Pooled, common: Tensor, chart: str, slope_std: float = 0.
 
     Differentiable.
     """
-    seen = (pooled.count > 0)[..., None]
+    seen = (pooled.hits > 0)[..., None]
     vector, matrix = pooled.information
     if chart == "cartesian":
-        one = columns(*(torch.full_like(pooled.count, float(k in (0, 3, 5))) for k in range(6)))
+        one = columns(*(torch.full_like(pooled.hits, float(k in (0, 3, 5))) for k in range(6)))
         cov = inverse3(torch.where(seen, matrix, one))
         mean = times3(cov, vector)
         matrix = torch.where(seen, inverse3(cov + common), matrix)
@@ -138,8 +180,8 @@ def nearness(information: Information, slope: float = 0.0, weak: Tensor | float 
 
 def found_points(pooled: Pooled, cells: Tensor, chart: str, slope_std: float, far_m: float = 1000.0) -> Tensor:
     """Where a saccade alone sees each cell's point, (..., Nx, 3) [m]; 1 m out where it saw none."""
-    seen = pooled.count > 0
-    one, zero = torch.ones_like(pooled.count), torch.zeros_like(pooled.count)
+    seen = pooled.hits > 0
+    one, zero = torch.ones_like(pooled.hits), torch.zeros_like(pooled.hits)
     vector, matrix = pooled.information
     if chart == "cartesian":
         safe = torch.where(seen[..., None], matrix, columns(one, zero, zero, one, zero, one))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import zipfile
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,9 +33,10 @@ def save_memory(path: str | os.PathLike[str], memory: EgoSphere, chart: str) -> 
     require(str(path).endswith(".npz"), "path", path, "a name that ends in .npz")
     require(chart in ("inverse_range", "cartesian"), "chart", chart, "inverse_range or cartesian")
     parts = (memory.cells, *memory.information, memory.bearing, memory.looks)
-    arrays = {name: part.detach().cpu().numpy() for name, part in zip(_PARTS, parts, strict=True)}
+    arrays: dict[str, Any] = {n: part.detach().cpu().numpy() for n, part in zip(_PARTS, parts, strict=True)}
+    arrays["chart"] = np.array(chart)
     with replacing(path) as temporary:
-        np.savez_compressed(temporary, chart=np.array(chart), **arrays)
+        np.savez_compressed(temporary, **arrays)
 
 
 def load_memory(path: str | os.PathLike[str]) -> tuple[EgoSphere, str]:

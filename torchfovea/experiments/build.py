@@ -195,7 +195,7 @@ def build_arena(cfg: DictConfig, observer: Observer, seed: int) -> Arena:
     )
     matcher = build_matcher(cfg)  # checked even where it is not used
     sample = None if OmegaConf.select(cfg, "sensor.sample") is None else whole(cfg, "sensor.sample", 16)
-    return Arena(world, observer, None if fidelity == "geometric" else matcher, sample)
+    return Arena(world, observer, None if fidelity == "geometric" else matcher, sample, seed)
 
 
 def build_matcher(cfg: DictConfig) -> tuple[SGBM, float]:

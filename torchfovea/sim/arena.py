@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -42,28 +43,45 @@ class Arena:
         observer: whose retina and error budget the sensor has.
         matcher: SGBM's parameters and the nearest range it searches [m]; None: the geometric sensor.
         sample: how many receptive fields a look goes through, drawn anew each time; None: all of them.
+        seed: of the encoders' noise, where the observer's head has any: it then believes them, and the world does not.
     """
 
     def __init__(
-        self, world: World, observer: Observer, matcher: tuple[SGBM, float] | None, sample: int | None = None
+        self,
+        world: World,
+        observer: Observer,
+        matcher: tuple[SGBM, float] | None,
+        sample: int | None = None,
+        seed: int = 0,
     ) -> None:
         self.world, self.observer, self.matcher, self.sample = world, observer, matcher, sample
+        self.noise = torch.Generator().manual_seed(seed)
 
     def saccade(self, gaze: Gaze) -> Move:
-        """Move the head and wait until it rests."""
-        return Move(*self.world.saccade(gaze))
+        """Move the head and wait until it rests; the gaze that comes back is what the encoders tell."""
+        moved = self.world.saccade(gaze)
+        sigma = math.radians(self.observer.head.encoder_deg)
+        error = sigma * torch.randn(3, generator=self.noise, dtype=torch.float64)
+        return Move(Gaze(*(a + e for a, e in zip(moved.gaze, error, strict=True))), *moved[1:])
+
+    def _true(self, gaze: Gaze) -> Gaze:
+        """Where the head really looks; with exact encoders wherever one asks."""
+        if self.observer.head.encoder_deg == 0:
+            return gaze
+        return Gaze(*(angle.to(told) for angle, told in zip(self.world.gaze, gaze, strict=True)))
 
     def fixation(self, gaze: Gaze) -> Fixation:
         """The first surface on the cyclopean ray."""
-        seen = self.world.fixated(gaze)
+        seen = self.world.fixated(self._true(gaze))
         return Fixation(seen.point_e, seen.range_m, seen.is_floor, seen.is_target)
 
     def look(self, gaze: Gaze, generator: torch.Generator) -> Look:
         """Sense at a gaze; the generator draws the geometric sensor's noise."""
         observer = self.observer
+        believed, gaze = gaze, self._true(gaze)
         if self.matcher is not None:
             left, right = self.world.images(gaze)
-            rig = verged(gaze.vergence, observer.head.baseline_m)
+            rig = verged(believed.vergence, observer.head.baseline_m)
             params, nearest_m = self.matcher
             matches, disparity = match_sgbm(
                 left.image, right.image, rig, observer.camera, observer.retina, params, observer.budget, nearest_m

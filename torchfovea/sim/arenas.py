@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -30,6 +31,7 @@ class GeometricArenas:
         sample: how many receptive fields a look goes through, drawn anew each time; None: all of them.
         device: where rays are traced, in float64.
         motor: its model of durations.
+        seed: of the encoders' noise, see `torchfovea.sim.arena.Arena`.
     """
 
     def __init__(
@@ -39,6 +41,7 @@ class GeometricArenas:
         sample: int | None = None,
         device: torch.device | str = "cpu",
         motor: InstantMotor | None = None,
+        seed: int = 0,
     ) -> None:
         self.observer, self.sample, self.motor = observer, sample, motor or InstantMotor()
         self.solids = solids_of(scenes, device)
@@ -47,9 +50,10 @@ class GeometricArenas:
             [torch.nn.functional.pad(scene.kind, (0, most - len(scene.kind)), value=-1) for scene in scenes]
         ).to(device)
         self.before = torch.zeros(len(scenes), 3, dtype=torch.float64)
+        self.noise = torch.Generator().manual_seed(seed)
 
     def saccade(self, gaze: Gaze) -> Move:
-        """Turn each head to its gaze, clamped to the limits."""
+        """Turn each head to its gaze, clamped to the limits; the gazes that come back are what the encoders tell."""
         head = self.observer.head
         command = clamp_gaze(head, Gaze(*(angle.detach().cpu().double() for angle in gaze)))
         last = Gaze(*self.before.unbind(-1))
@@ -60,10 +64,19 @@ class GeometricArenas:
             for then, now in zip(zip(*last, strict=True), zip(*command, strict=True), strict=True)
         ]
         self.before = torch.stack(command, -1)
-        return Move(command, torch.tensor(seconds, dtype=torch.float64), degrees)
+        error = torch.randn(self.before.shape, generator=self.noise, dtype=torch.float64)
+        told = Gaze(*(self.before + math.radians(head.encoder_deg) * error).unbind(-1))
+        return Move(told, torch.tensor(seconds, dtype=torch.float64), degrees)
+
+    def _true(self, gaze: Gaze) -> Gaze:
+        """Where the heads really look; with exact encoders wherever one asks."""
+        if self.observer.head.encoder_deg == 0:
+            return gaze
+        return Gaze(*(angle.to(told) for angle, told in zip(self.before.unbind(-1), gaze, strict=True)))
 
     def fixation(self, gaze: Gaze) -> Fixation:
         """The first surface on each cyclopean ray."""
+        gaze = self._true(gaze)
         rotation, origin = cyclopean(self.observer.head, Gaze(*(angle.to(self.kind.device).double() for angle in gaze)))
         range_m, geom = trace(self.solids, origin, rotation[:, None, :, 2])
         point = origin + range_m * rotation[..., 2]
@@ -72,7 +85,7 @@ class GeometricArenas:
 
     def look(self, gaze: Gaze, generators: Sequence[torch.Generator]) -> Look:
         """Sense at each gaze; each generator draws its episode's receptive fields and noise."""
-        observer, device = self.observer, gaze.pan.device
+        observer, device, gaze = self.observer, gaze.pan.device, self._true(gaze)
         pose = eyes(observer.head, gaze)
         left_px = observer.retina.centers_px(device, gaze.pan.dtype)
         chosen = [draw_fields(observer.retina.count, self.sample, generator) for generator in generators]
