@@ -17,12 +17,18 @@ LONGEST = 320
 FLOORS = (
     ("setting", "files"),
     ("gaussian",),
-    ("camera", "layout", "retina", "sheets", "head", "unscented", "chart", "sphere", "nearest", "significance"),
+    ("camera", "layout", "retina", "sheets", "head", "unscented", "chart", "significance"),
+    ("topology", "sphere", "cell_index", "nearest"),
     (
         "correspondence",
+        "confidence",
         "sgbm",
         "semiglobal",
+        "costs",
+        "surfaces",
         "sweep",
+        "disparity_files",
+        "external",
         "rig",
         "rectified",
         "matching",
@@ -42,6 +48,7 @@ FLOORS = (
         "strategies",
         "reward",
         "metrics",
+        "calibration",
         "characterization",
         "propagation",
         "plane",
@@ -50,7 +57,7 @@ FLOORS = (
     ("perception", "arena"),
     ("tuning", "episode"),
     ("sim",),
-    ("pictures", "pictures_sensor", "pictures_reproduce", "config", "mistakes"),
+    ("pictures", "pictures_tuning", "pictures_sensor", "pictures_reproduce", "pictures_calibration", "config", "mistakes"),
     ("cli", "experiments", "doctor", "bench", "__main__"),
 )
 FLOOR = {module: floor for floor, modules in enumerate(FLOORS) for module in modules}
@@ -60,8 +67,8 @@ ONLY_IN = {
     "mujoco": {"sim"},
     "hydra": {"cli", "config", "mistakes", "experiments"},
     "omegaconf": {"cli", "config", "mistakes", "experiments", "doctor"},
-    "matplotlib": {"pictures", "pictures_sensor", "pictures_reproduce"},
-    "cv2": {"sgbm", "bench", "experiments"},
+    "matplotlib": {"pictures", "pictures_tuning", "pictures_sensor", "pictures_reproduce", "pictures_calibration"},
+    "cv2": {"sgbm", "disparity_files", "bench", "experiments"},
     "rich": {"cli", "experiments", "doctor"},
     "skimage": {"experiments"},
 }

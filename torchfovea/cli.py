@@ -39,6 +39,31 @@ COMMANDS: dict[str, Command] = {
         "a stereo pair in, 3-D points with covariances out",
         "torchfovea sense pair=motorcycle",
     ),
+    "characterize": Command(
+        "torchfovea.experiments.characterize:run",
+        "what two eyes know of planes, foveal and uniform (Fig. 5), and how far to believe it",
+        "torchfovea characterize profile=quick",
+    ),
+    "tune": Command(
+        "torchfovea.experiments.tune:run",
+        "learn the memory's bias and alpha by gradient on simulated episodes",
+        "torchfovea tune profile=quick distribution=left_below",
+    ),
+    "reproduce": Command(
+        "torchfovea.experiments.reproduce:run",
+        "the paper's figures and claims, measured again, with intervals and verdicts",
+        "torchfovea reproduce profile=quick",
+    ),
+    "collect": Command(
+        "torchfovea.experiments.collect:run",
+        "a sweep's results in one table",
+        "torchfovea collect dir=multirun/search/study",
+    ),
+    "calibrate": Command(
+        "torchfovea.experiments.calibrate:run",
+        "is the claimed uncertainty true? fit the error budget and judge it",
+        "torchfovea calibrate real=true",
+    ),
     "doctor": Command("torchfovea.doctor:run", "what this machine can render and has", "torchfovea doctor"),
 }
 

@@ -44,7 +44,7 @@ def one_episode(
     """The episode of one seed, with whatever sensor, renderer and motor."""
     generator = torch.Generator().manual_seed(seed)
     arena = build_arena(cfg, observer, seed)
-    mind = new_mind(observer, build_cells(cfg, observer.head, generator))
+    mind = new_mind(observer, build_cells(_aimed(cfg, arena.world.scene), observer.head, generator))
     truth = arena.truth(mind.memory.cells)
     observer = dataclasses.replace(observer, acquisition=build_strategy(cfg, observer, _aim(truth)))
     return run_episode(
@@ -55,6 +55,16 @@ def one_episode(
 
 def _aim(truth: Truth) -> Tensor:
     return torch.nn.functional.normalize(truth.nearest_point, dim=-1)
+
+
+def _aimed(cfg: DictConfig, scene: Scene) -> DictConfig:
+    """The settings with a memory that is centred on the scene's own target, if it has no mean of its own."""
+    if "means" not in cfg.memory or cfg.memory.means is not None:
+        return cfg
+    mean = torch.nn.functional.normalize(scene.nearest_point_e, dim=-1).tolist()
+    merged = OmegaConf.merge(cfg, {"memory": {"means": [mean]}})
+    assert isinstance(merged, DictConfig)
+    return merged
 
 
 @lru_cache(maxsize=64)
@@ -74,7 +84,8 @@ def prepare(cfg: DictConfig, observer: Observer, seed: int) -> tuple[Scene, Mind
     """What an episode starts from; scenes and memories are kept for the next call with the same settings."""
     scene = _scene(OmegaConf.to_yaml(OmegaConf.masked_copy(cfg, ["scene"]), resolve=True), observer.head, seed)
     plain = dataclasses.replace(observer, acquisition=Observer().acquisition)
-    mind, state = _start(OmegaConf.to_yaml(OmegaConf.masked_copy(cfg, ["memory"]), resolve=True), plain, seed)
+    memory = OmegaConf.masked_copy(_aimed(cfg, scene), ["memory"])
+    mind, state = _start(OmegaConf.to_yaml(memory, resolve=True), plain, seed)
     generator = torch.Generator()
     generator.set_state(state)
     return scene, mind, truth_of(scene, mind.memory.cells), generator

@@ -1,0 +1,61 @@
+"""`torchfovea collect`: the results of a sweep, or of any runs below a folder, in one table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+
+from torchfovea.config import run_folder
+from torchfovea.experiments.manifest import read_result
+from torchfovea.files import write_csv, write_result
+from torchfovea.setting import SettingError, require
+
+__all__ = ["run"]
+
+
+def run(cfg: DictConfig) -> float:
+    """Write collect.csv: a row for each run, its overrides and figures; the number of rows is what a sweeper sees."""
+    source = Path(str(cfg.dir)).expanduser()
+    require(source.is_dir(), "dir", source, "a folder of runs")
+    rows, unfinished, corrupt = [], [], []
+    for folder in sorted(path.parent for path in source.rglob(".hydra")):
+        name = str(folder.relative_to(source))
+        if not (folder / "result.json").exists():
+            unfinished.append(name)
+            continue
+        try:
+            rows.append({"run": name, **_overrides(folder), **_figures(folder)})
+        except (SettingError, OSError) as error:
+            corrupt.append(name)
+            _say(f"{name}: {error}")
+    for name in unfinished:
+        _say(f"{name}: no result.json (unfinished or failed); start the sweep again to run it")
+    require(bool(rows), "dir", source, "a folder with at least one complete run")
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    folder = run_folder()
+    write_csv(folder / "collect.csv", columns, [[row.get(key) for key in columns] for row in rows])
+    write_result(folder, {"rows": len(rows), "unfinished": len(unfinished), "corrupt": len(corrupt)})
+    return float(len(rows))
+
+
+def _say(line: str) -> None:
+    Console(stderr=True).print(f"collect: {line}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _overrides(folder: Path) -> dict[str, str]:
+    """The settings that the run was started with."""
+    try:
+        given = OmegaConf.load(folder / ".hydra" / "overrides.yaml")
+    except Exception as error:
+        raise SettingError(f"{folder}/.hydra/overrides.yaml: {error}: expected a run's settings") from None
+    pairs = (str(override).lstrip("+~").partition("=") for override in given)
+    return {key: value for key, _, value in pairs}
+
+
+def _figures(folder: Path) -> dict[str, Any]:
+    """The run's figures that are single numbers or words."""
+    result = read_result(folder / "result.json")
+    return {key: value for key, value in result.items() if not isinstance(value, dict | list)}

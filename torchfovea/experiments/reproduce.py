@@ -1,0 +1,172 @@
+"""`torchfovea reproduce`: Figs. 5, 8 and 9 and the claims of Sec. 7, measured again, with intervals and verdicts."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from torchfovea.config import run_folder
+from torchfovea.experiments.build import whole
+from torchfovea.experiments.cells import METRICS, Task, cells_of, run_task, task_name
+from torchfovea.experiments.claims import Claim, Verdict, judge, read_claims, select
+from torchfovea.experiments.fig5 import judge_fig5
+from torchfovea.experiments.manifest import finished
+from torchfovea.experiments.report import write_report
+from torchfovea.files import write_csv, write_json, write_result
+from torchfovea.mistakes import describe
+from torchfovea.setting import SettingError
+
+__all__ = ["EPISODE_COLUMNS", "run"]
+
+LABELS = ("fig", "scene", "reading", "sensor", "fov_deg", "bias", "variant", "arm", "seed")
+EPISODE_COLUMNS = (*LABELS, *METRICS)
+
+Row = dict[str, Any]
+
+
+def run(cfg: DictConfig) -> float:
+    """Run or resume a reproduction; the number of claims that hold is what a sweeper sees."""
+    folder = run_folder()
+    whole(cfg, "episodes", 2)
+    whole(cfg, "memory.cells")
+    whole(cfg, "sensor.receptive_fields", 16)
+    done = finished(cfg, folder, "claims_hold")
+    if done is not None:
+        return done
+    plain: Any = OmegaConf.to_container(cfg, resolve=True)
+    claims = read_claims(plain["claims"])
+    start = time.perf_counter()
+    rows = _episodes(cells_of(cfg), folder / "cells", whole(cfg, "workers"))
+    seconds = time.perf_counter() - start
+    write_csv(folder / "episodes.csv", EPISODE_COLUMNS, [[row[c] for c in EPISODE_COLUMNS] for row in rows])
+    counting = select(rows, plain["counts"])
+    verdicts = judge(claims, counting, plain["level"], plain["seed"])
+    stated = [_stated(c, v) for c, v in zip(claims, verdicts, strict=True)]
+    planes, fig5 = judge_fig5(plain["fig5"], plain["sensor"]["receptive_fields"])
+    stated += planes
+    elsewhere = _elsewhere(claims, rows, plain)
+    for entry in stated:
+        entry["elsewhere"] = {place: found.get(entry["id"]) for place, found in elsewhere.items()}
+    write_json(folder / "claims.json", stated)
+    figures: Row = {"claims": len(stated)}
+    for name, verdict in (("hold", "holds"), ("fail", "fails"), ("undecided", "undecided")):
+        figures[f"claims_{name}"] = sum(entry["verdict"] == verdict for entry in stated)
+    figures |= {"episodes": len(rows), "seconds": seconds, "scenes": plain["episodes"]}
+    write_report(folder, plain, rows, stated, figures, fig5)
+    write_result(folder, figures)
+    _print(stated)
+    return float(figures["claims_hold"])
+
+
+def _stated(claim: Claim, verdict: Verdict) -> Row:
+    head = {key: getattr(claim, key) for key in ("id", "section", "text", "definition")}
+    return {**head, **asdict(verdict), "metric": claim.metric}
+
+
+def _elsewhere(claims: list[Claim], rows: list[Row], plain: Row) -> dict[str, dict[str, str]]:
+    """The verdicts under the other readings and scenes, each a family of its own; they do not count."""
+    conditions = {(row["reading"], row["scene"]) for row in rows if row["fig"] in (8, 9)}
+    conditions -= {(plain["counts"]["reading"], plain["counts"]["scene"])}
+    found = {}
+    for reading, scene in sorted(conditions):
+        verdicts = judge(claims, select(rows, {"reading": reading, "scene": scene}), plain["level"], plain["seed"])
+        found[f"{reading}, {scene}"] = {
+            claim.id: verdict.verdict for claim, verdict in zip(claims, verdicts, strict=True) if verdict.n >= 2
+        }
+    return found
+
+
+def _episodes(tasks: list[Task], folder: Path, workers: int) -> list[Row]:
+    """All rows: of the tasks already complete in the folder, and of the others, run now.
+
+    Raises:
+        SettingError: tasks that failed, after the others are done; a file that does not hold a task's rows.
+    """
+    rows: list[Row] = []
+    missing = []
+    for task in tasks:
+        path = folder / f"{task_name(task)}.json"
+        if path.exists():
+            rows += _read(path, task)
+        else:
+            missing.append(task)
+    failed = []
+    bars = (TextColumn("reproduce"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    console = Console(stderr=True)
+    with Progress(*bars, console=console, transient=True, disable=not console.is_terminal) as progress:
+        bar = progress.add_task("reproduce", total=len(missing))
+        for task, outcome in _outcomes(missing, workers):
+            name = task_name(task)
+            if isinstance(outcome, Exception):
+                line = describe(outcome, task.overrides) or f"{type(outcome).__name__}: {outcome}"
+                failed.append(name)
+                console.print(f"reproduce: {name}: {line}", highlight=False, markup=False, soft_wrap=True)
+            else:
+                write_json(folder / f"{name}.json", outcome)
+                rows += outcome
+            progress.advance(bar)
+    if failed:
+        raise SettingError(
+            f"cells = {len(failed)} of {len(tasks)} failed ({', '.join(failed[:3])}{', ...' * (len(failed) > 3)}): "
+            f"expected all; the others are kept in {folder}, to be resumed with hydra.run.dir={folder.parent}"
+        )
+    order = {name: k for k, name in enumerate(LABELS)}
+    return sorted(rows, key=lambda row: [str(row[name]) for name in order])
+
+
+def _read(path: Path, task: Task) -> list[Row]:
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8"))
+        complete = len(rows) == len(task.seeds) * max(1, len(task.alphas)) and all("gap_final" in row for row in rows)
+    except (ValueError, TypeError):
+        complete = False
+    if not complete:
+        raise SettingError(f"{path} = corrupt: expected the rows of its episodes; remove it to run them again")
+    return rows
+
+
+def _outcomes(tasks: list[Task], workers: int) -> Iterator[tuple[Task, list[Row] | Exception]]:
+    """Each task with its rows or its error, as they come."""
+    if workers == 1:
+        for task in tasks:
+            try:
+                yield task, run_task(task)
+            except Exception as error:
+                yield task, error
+        return
+    with ProcessPoolExecutor(workers, get_context("spawn"), torch.set_num_threads, (1,)) as pool:
+        waiting = {pool.submit(run_task, task): task for task in tasks}
+        try:
+            for future in as_completed(waiting):
+                error = future.exception()
+                if error is not None and not isinstance(error, Exception):
+                    raise error
+                yield waiting[future], error if isinstance(error, Exception) else future.result()
+        except BaseException:
+            for future in waiting:
+                future.cancel()
+            raise
+
+
+def _print(stated: list[Row]) -> None:
+    table = Table(box=None, padding=(0, 2, 0, 0))
+    for column in ("claim", "verdict", "estimate", "95% CI", "n"):
+        table.add_column(column)
+    for entry in stated:
+        low, high = entry["ci_low"], entry["ci_high"]
+        estimate = "-" if entry["estimate"] is None else f"{entry['estimate']:.3g}"
+        interval = "-" if low is None else f"{low:.3g} to {high:.3g}"
+        table.add_row(entry["id"], entry["verdict"], estimate, interval, str(entry["n"]))
+    Console().print(table)
