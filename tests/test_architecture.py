@@ -57,7 +57,7 @@ FLOORS = (
     ("perception", "arena"),
     ("tuning", "episode"),
     ("sim",),
-    ("pictures", "pictures_tuning", "pictures_sensor", "pictures_reproduce", "pictures_calibration", "config", "mistakes"),
+    ("pictures", "pictures_memory", "pictures_tuning", "pictures_sensor", "pictures_reproduce", "pictures_calibration", "config", "mistakes"),
     ("cli", "experiments", "doctor", "bench", "__main__"),
 )
 FLOOR = {module: floor for floor, modules in enumerate(FLOORS) for module in modules}
@@ -67,7 +67,7 @@ ONLY_IN = {
     "mujoco": {"sim"},
     "hydra": {"cli", "config", "mistakes", "experiments"},
     "omegaconf": {"cli", "config", "mistakes", "experiments", "doctor"},
-    "matplotlib": {"pictures", "pictures_tuning", "pictures_sensor", "pictures_reproduce", "pictures_calibration"},
+    "matplotlib": {"pictures", "pictures_memory", "pictures_tuning", "pictures_sensor", "pictures_reproduce", "pictures_calibration"},
     "cv2": {"sgbm", "disparity_files", "bench", "experiments"},
     "rich": {"cli", "experiments", "doctor"},
     "skimage": {"experiments"},

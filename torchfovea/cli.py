@@ -64,6 +64,11 @@ COMMANDS: dict[str, Command] = {
         "is the claimed uncertainty true? fit the error budget and judge it",
         "torchfovea calibrate real=true",
     ),
+    "memory": Command(
+        "torchfovea.experiments.memory:run",
+        "draw and describe a memory's bias, or study how the memory fuses, moves and is drawn anew",
+        "torchfovea memory memory=target",
+    ),
     "doctor": Command("torchfovea.doctor:run", "what this machine can render and has", "torchfovea doctor"),
 }
 
