@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from torchfovea.camera import Camera, Pinhole
-from torchfovea.correspondence import Budget, Correspondences, Disparity, eye_sigma_px
+from torchfovea.confidence import read_clues
+from torchfovea.correspondence import Budget, Clues, Correspondences, Disparity, doubt, eye_sigma_px
 from torchfovea.gaussian import columns
 from torchfovea.retina import Retina, fovea, interpolate
 from torchfovea.rig import StereoRig, posed, verged
@@ -103,10 +104,11 @@ def match_sgbm(
     there = view.rays(columns(place[..., 0] - shift, place[..., 1])) @ R_right
     right_px = camera.project(there)
     found &= camera.in_view(there) & retina.inside(right_px)
-    # for pictures: nothing where the left eye does not look
+    # nothing where the left eye does not look
     looks = retina.inside(seen[0]) & camera.in_view(rays @ R_left)
     disparity = disparity._replace(image=disparity.image * looks, valid=disparity.valid & looks)
-    return correspondences(left_px, right_px, found, retina, budget), disparity
+    clues = read_clues(disparity, place, shift, retina.width_px(left_px) * (size / (2 * retina.radius_px)))
+    return correspondences(left_px, right_px, found, retina, budget, clues), disparity
 
 
 def grey_pair(left: Tensor | np.ndarray, right: Tensor | np.ndarray) -> Tensor:
@@ -205,12 +207,18 @@ def in_range(shift: Tensor, reach: float, nearest_m: float, farthest_m: float) -
 
 
 def correspondences(
-    left_px: Tensor, right_px: Tensor, valid: Tensor, retina: Retina | None, budget: Budget
+    left_px: Tensor,
+    right_px: Tensor,
+    valid: Tensor,
+    retina: Retina | None,
+    budget: Budget,
+    clues: Clues | None = None,
 ) -> Correspondences:
     """Places (N, 2) in both eyes with their σ from the budget; without a retina in image pixels."""
     right_px = torch.where(valid[:, None], right_px, left_px)
     if retina is None:  # the RFs are the source's pixels
-        sigma = math.sqrt(budget.sigma_over_width**2 + budget.match_px**2)
-        return Correspondences(left_px, right_px, *(torch.full_like(left_px[:, 0], sigma),) * 2, valid)
-    left_sigma, right_sigma = (eye_sigma_px(budget, retina, px) for px in (left_px, right_px))
+        square = torch.full_like(left_px[:, 0], budget.sigma_over_width**2 + budget.match_px**2)
+        sigma = (square if clues is None else square + doubt(budget, clues)).sqrt()
+        return Correspondences(left_px, right_px, sigma, sigma, valid)
+    left_sigma, right_sigma = (eye_sigma_px(budget, retina, px, clues) for px in (left_px, right_px))
     return Correspondences(left_px, right_px, left_sigma, right_sigma, valid)

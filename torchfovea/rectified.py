@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.camera import Pinhole
+from torchfovea.confidence import read_clues
 from torchfovea.correspondence import Budget, Correspondences, Disparity
 from torchfovea.gaussian import columns
 from torchfovea.matching import check_range, correspondences, dense_disparity, grey_pair, in_range, read_disparity
@@ -170,7 +171,10 @@ def match_disparity(
         Pinhole(camera.focal_px / scale, (camera.cx_px - u0) / scale, (camera.cy_px - v0) / scale)
         for camera in (camera_left, camera_right)
     ]
-    return RectifiedMatch(correspondences(left_px, right_px, found, retina, budget), cameras[0], cameras[1], field)
+    width_px = torch.ones_like(shift) if retina is None else retina.width_px(left_px) * scale
+    clues = read_clues(field, place, shift, width_px)
+    matches = correspondences(left_px, right_px, found, retina, budget, clues)
+    return RectifiedMatch(matches, cameras[0], cameras[1], field)
 
 
 def _doffs(camera_left: Pinhole, camera_right: Pinhole, baseline_m: float) -> float:

@@ -1,0 +1,130 @@
+"""Observations whose truth is known, for `torchfovea calibrate`: simulated looks, and pairs with disparity."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from omegaconf import DictConfig
+from torch import Tensor
+
+from torchfovea.calibration import Judged, judged
+from torchfovea.camera import Camera
+from torchfovea.confidence import read_clues
+from torchfovea.correspondence import Budget, Clues, Correspondences, Disparity
+from torchfovea.experiments.build import build_sensor, choice, construct, number
+from torchfovea.experiments.sense import load_pair
+from torchfovea.head import Eyes, Gaze, eyes
+from torchfovea.layout import Retina
+from torchfovea.matching import match_sgbm
+from torchfovea.rectified import match_disparity, match_rectified
+from torchfovea.rig import StereoRig, verged
+from torchfovea.setting import SettingError, require
+from torchfovea.sgbm import SGBM
+from torchfovea.sim.world import World
+from torchfovea.sweep import Sweep, match_sweep
+
+__all__ = ["Matcher", "Truths", "build_truths_matcher", "look_at_pair", "look_at_world"]
+
+
+class Matcher(NamedTuple):
+    """A matcher's parameters and the nearest range that it searches [m]."""
+
+    params: SGBM | Sweep
+    nearest_m: float
+
+
+class Truths(NamedTuple):
+    """What one look tells.
+
+    Attributes:
+        data: the observations, M of them.
+        right_of_middle_px: (M,), where the left image shows them, from its middle column [px].
+        valid_fraction: share of the receptive fields that the matcher calls valid.
+    """
+
+    data: Judged
+    right_of_middle_px: Tensor
+    valid_fraction: float
+
+
+def build_truths_matcher(cfg: DictConfig) -> Matcher:
+    """The matcher to calibrate."""
+    name = choice(cfg, "matcher.name", ("sgbm", "sweep"))
+    kind: type[SGBM] | type[Sweep] = SGBM if name == "sgbm" else Sweep
+    return Matcher(construct(kind, cfg.matcher, "matcher"), number(cfg, "matcher.nearest_range_m"))
+
+
+def look_at_world(world: World, gaze: Gaze, retina: Retina, budget: Budget, matcher: Matcher) -> Truths:
+    """Match both eyes' pictures; the truth is cast along the left receptive fields' rays."""
+    left, right = (frame.image for frame in world.images(gaze))
+    rig, pose = verged(gaze.vergence, world.head.baseline_m), eyes(world.head, gaze)
+    clues = None
+    if isinstance(matcher.params, SGBM):
+        matches, disparity = match_sgbm(
+            left, right, rig, world.camera, retina, matcher.params, budget, matcher.nearest_m
+        )
+        place = disparity.camera.project(world.camera.rays(matches.left_px) @ rig.R_left.to(matches.left_px).mT)
+        other = disparity.camera.project(world.camera.rays(matches.right_px) @ rig.R_right.to(matches.left_px).mT)
+        clues = _clues(disparity, place, (place - other)[:, 0], retina, world.source_px)
+    else:
+        matches, _ = match_sweep(left, right, rig, world.camera, retina, matcher.params, budget, matcher.nearest_m)
+    seen = world.correspond(gaze, world.camera.rays(matches.left_px))
+    away = torch.linalg.vector_norm(seen.points_e.double() - pose.t_left, dim=-1)
+    truth = torch.where(seen.hit, 1 / away, torch.zeros_like(away))
+    data, which = judged(matches, pose, world.camera, retina, budget, truth, clues)
+    return Truths(data, matches.left_px[which, 0], float(matches.valid.double().mean()))
+
+
+def look_at_pair(cfg: DictConfig, budget: Budget, matcher: Matcher) -> Truths:
+    """Match a rectified pair; the truth is its disparity.
+
+    Raises:
+        SettingError: for a pair without true disparity.
+    """
+    pair = load_pair(cfg)
+    if pair.disparity is None:
+        raise SettingError("disparity = null: expected the true disparity of the pair, to judge by")
+    retina = build_sensor(cfg)[1]
+    if cfg.gaze_px is not None:
+        require(len(cfg.gaze_px) == 2, "gaze_px", cfg.gaze_px, "[column, row]")
+    gaze = None if cfg.gaze_px is None else (float(cfg.gaze_px[0]), float(cfg.gaze_px[1]))
+    height, width = pair.left.shape[-2:]
+    cameras = pair.camera_left, pair.camera_right, pair.baseline_m
+    true = match_disparity(pair.disparity, *cameras, retina, gaze, nearest_range_m=1e-3)
+    scale = pair.camera_left.focal_px / true.camera_left.focal_px
+    middle = true.correspondences.left_px.new_tensor(gaze or ((width - 1) / 2, (height - 1) / 2))
+    place = true.correspondences.left_px * scale + middle
+    same = torch.eye(3)
+    pose = Eyes(same, torch.zeros(3), same, torch.tensor([pair.baseline_m, 0.0, 0.0]))
+    source = min(height, width)
+    budget = replace(budget, source_px=source)
+    clues = None
+    if isinstance(matcher.params, SGBM):
+        found = match_rectified(
+            pair.left, pair.right, *cameras, retina, gaze, matcher.params, budget, matcher.nearest_m
+        )
+        matches = found.correspondences
+        shift = (matches.left_px - matches.right_px)[:, 0] * scale
+        clues = _clues(found.disparity, place, shift, retina, source)
+    else:
+        matches, _ = match_sweep(
+            pair.left, pair.right, StereoRig(same, same, pair.baseline_m), true.camera_left, retina, matcher.params,
+            budget, matcher.nearest_m, camera_right=true.camera_right, gaze_px=gaze,
+        )  # fmt: skip
+    truth = _inverse_range(true.correspondences, true.camera_left, true.camera_right, pair.baseline_m)
+    truth = torch.where(true.correspondences.valid, truth, torch.zeros_like(truth))
+    data, which = judged(matches, pose, true.camera_left, retina, budget, truth, clues, true.camera_right)
+    return Truths(data, (place[:, 0] - (width - 1) / 2)[which], float(matches.valid.double().mean()))
+
+
+def _inverse_range(matches: Correspondences, left: Camera, right: Camera, baseline_m: float) -> Tensor:
+    """Of places (N, 2) in both rectified cameras, along the left ray."""
+    one, other = left.rays(matches.left_px), right.rays(matches.right_px)
+    return (one - other)[:, 0] / baseline_m / torch.linalg.vector_norm(one, dim=-1)
+
+
+def _clues(disparity: Disparity, place: Tensor, shift: Tensor, retina: Retina, source_px: int) -> Clues:
+    width_px = retina.width_px(retina.centers_px(place.device, place.dtype)) * (source_px / (2 * retina.radius_px))
+    return read_clues(disparity, place, shift, width_px)
