@@ -1,0 +1,418 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import convolve
+
+from torchfovea.camera import Fisheye, Pinhole, image_camera
+from torchfovea.correspondence import Budget, eye_sigma_px
+from torchfovea.head import Eyes
+from torchfovea.layout import LogPolar, Uniform
+from torchfovea.rig import StereoRig, posed, verged
+from torchfovea.semiglobal import aggregate
+from torchfovea.setting import SettingError
+from torchfovea.sheets import average, nearest_rf, read_sheet, sheets
+from torchfovea.sweep import Sweep, Volume, match_sweep, match_sweep_rectified
+from torchfovea.triangulation import observe
+
+BASELINE_M = 0.2
+RETINAS = [LogPolar(3000), Uniform(3000), LogPolar(3000, uniform_fovea=True)]
+IDS = ["log_polar", "uniform", "uniform_fovea"]
+
+
+def texture(points, seed=0, waves=80, finest_m=0.06):
+    """A smooth random pattern in space, (..., 3) to (...), 0 to 1."""
+    rng = np.random.default_rng(seed)
+    k = torch.from_numpy(rng.normal(size=(waves, 3)))
+    k = (
+        k
+        / k.norm(dim=-1, keepdim=True)
+        * torch.from_numpy(2 * math.pi / (finest_m * 8 ** rng.uniform(size=(waves, 1))))
+    )
+    phase = torch.from_numpy(rng.uniform(0, 2 * math.pi, waves))
+    return 0.5 + 0.45 * torch.tanh(torch.cos(points @ k.T + phase).mean(-1) * math.sqrt(waves))
+
+
+def plane_hit(origin, directions, normal, distance):
+    """The range along rays (..., 3) at which they meet the plane normal · X = distance; infinite if they do not."""
+    along = (distance - origin @ normal) / (directions @ normal)
+    return torch.where(along > 0, along, torch.full_like(along, math.inf))
+
+
+class Room:
+    """Textured planes in the rectified frame, seen by two eyes at (∓baseline/2, 0, 0)."""
+
+    def __init__(self, planes, vergence=0.15, camera=None, seed=0):
+        self.planes = [(torch.tensor(n, dtype=torch.float64), d, test) for n, d, test in planes]
+        self.rig = verged(vergence, BASELINE_M)
+        self.camera = camera or Pinhole.from_fov(90.0, 100.0)
+        self.seed = seed
+
+    def cast(self, origin, directions):
+        ranges = []
+        for normal, distance, inside in self.planes:
+            along = plane_hit(origin, directions, normal, distance)
+            point = origin + along.clamp(max=1e3)[..., None] * directions
+            ranges.append(torch.where(inside(point), along, torch.full_like(along, math.inf)))
+        return torch.stack(ranges).amin(0)
+
+    def eye(self, which):
+        side = -0.5 if which == 0 else 0.5
+        return torch.tensor([side * BASELINE_M, 0.0, 0.0], dtype=torch.float64), self.rig[which]
+
+    def images(self, size=160):
+        x = torch.arange(size, dtype=torch.float64)
+        px = torch.stack(torch.broadcast_tensors(x, x[:, None]), -1)
+        out = []
+        for which in (0, 1):
+            origin, rotation = self.eye(which)
+            rays = image_camera(self.camera, 100.0, size).rays(px) @ rotation.T
+            out.append(texture(origin + self.cast(origin, rays).clamp(max=50)[..., None] * rays, self.seed)[None])
+        return out
+
+    def truth(self, left_px):
+        """Right pixels, inverse range from the left eye and visibility, by ray casting."""
+        origin, rotation = self.eye(0)
+        rays = self.camera.rays(left_px.double()) @ rotation.T
+        rays = rays / rays.norm(dim=-1, keepdim=True)
+        along = self.cast(origin, rays)
+        point = origin + along[:, None] * rays
+        other, turned = self.eye(1)
+        line = point - other
+        seen = self.cast(other, line) > 1 - 1e-6
+        right = self.camera.project(line @ turned)
+        return right, 1 / along, seen & (right.norm(dim=-1) <= 100) & self.camera.in_view(line @ turned)
+
+
+def everywhere(point):
+    return torch.ones_like(point[..., 0], dtype=torch.bool)
+
+
+WALL = ((0.2, 0.1, 1.0), 1.3, everywhere)
+BOARD = ((0.0, 0.0, 1.0), 0.8, lambda p: (p[..., 0].abs() < 0.22) & (p[..., 1].abs() < 0.25))
+
+
+def widths(retina, px, size):
+    return retina.width_px(px).clamp(min=2 * retina.radius_px / size).double()
+
+
+@pytest.mark.parametrize("retina", RETINAS, ids=IDS)
+@pytest.mark.parametrize("camera", [Pinhole.from_fov(90.0, 100.0), Fisheye.from_fov(120.0, 100.0)], ids=["pin", "fish"])
+def test_a_slanted_wall(retina, camera):
+    room = Room([WALL], camera=camera)
+    matches, found = match_sweep(*room.images(), room.rig, camera, retina)
+    assert torch.equal(matches.left_px, retina.centers_px(dtype=torch.float64))
+    right, rho, seen = room.truth(matches.left_px)
+    inner = seen & (right.norm(dim=-1) < 90)
+    assert matches.valid[inner].double().mean() > 0.95
+    both = matches.valid & seen
+    error = (matches.right_px - right).norm(dim=-1)[both] / widths(retina, right, 160)[both]
+    assert error.median() < 0.15
+    assert (error > 1).double().mean() < 0.02
+    assert ((found.inverse_range - rho)[both].abs() / rho[both]).median() < 0.03
+    own = eye_sigma_px(Budget(source_px=160), retina, matches.right_px)
+    assert (matches.right_sigma_px >= own).all()
+    assert torch.equal(found.valid, matches.valid)
+    assert (found.inverse_range[~found.valid] == 0).all()
+
+
+def test_the_variance_follows_the_noise():
+    room = Room([WALL])
+    generator = torch.Generator().manual_seed(1)
+    left, right = room.images()
+    spreads, errors = [], []
+    for noise in (0.0, 0.06):
+        noisy = [
+            (i + noise * torch.randn(i.shape, generator=generator, dtype=i.dtype)).clamp(0, 1) for i in (left, right)
+        ]
+        matches, found = match_sweep(*noisy, room.rig, room.camera, LogPolar(3000))
+        _, rho, seen = room.truth(matches.left_px)
+        both = found.valid & seen
+        spreads.append(found.sigma[both].median())
+        errors.append(((found.inverse_range - rho)[both] / found.sigma[both]).abs().median())
+    assert spreads[1] > 1.3 * spreads[0]
+    assert 0.2 < errors[1] < 1.5  # 0.67 for a perfect Gaussian
+
+
+def test_what_the_right_eye_cannot_see_is_mostly_rejected():
+    room = Room([WALL, BOARD])
+    retina = Uniform(6000)
+    matches, _ = match_sweep(*room.images(200), room.rig, room.camera, retina)
+    right, _, seen = room.truth(matches.left_px)
+    hidden = ~seen & (right.norm(dim=-1) < 90)
+    assert hidden.sum() > 50
+    assert matches.valid[seen & (right.norm(dim=-1) < 90)].double().mean() > 0.93
+    unchecked, _ = match_sweep(*room.images(200), room.rig, room.camera, retina, Sweep(left_right_widths=math.inf))
+    assert matches.valid[hidden].double().mean() < 0.6 * unchecked.valid[hidden].double().mean()
+
+
+def test_a_volume_of_interest_settles_what_repeats():
+    """A wall of equal stripes fits at many depths; the memory knows which."""
+    room = Room([((0.0, 0.0, 1.0), 1.0, everywhere)], vergence=0.1)
+    size = 160
+    x = torch.arange(size, dtype=torch.float64)
+    px = torch.stack(torch.broadcast_tensors(x, x[:, None]), -1)
+    images = []
+    for which in (0, 1):
+        origin, rotation = room.eye(which)
+        rays = image_camera(room.camera, 100.0, size).rays(px) @ rotation.T
+        point = origin + room.cast(origin, rays)[..., None] * rays
+        images.append(
+            (0.5 + 0.3 * torch.sin(point[..., 0] * 2 * math.pi / 0.12) + 0.1 * torch.sin(60 * point[..., 1]))[None]
+        )
+    retina = Uniform(3000)
+    _, rho, seen = room.truth(retina.centers_px(dtype=torch.float64))
+    volume = Volume(rho + 0.1, torch.full_like(rho, 0.1))
+    _, found = match_sweep(*images, room.rig, room.camera, retina, volume=volume)
+    both = found.valid & seen
+    assert both.double().sum() > 0.8 * seen.double().sum()
+    assert ((found.inverse_range - rho)[both].abs() < 0.1).double().mean() > 0.95
+    assert ((found.inverse_range - volume.inverse_range).abs()[found.valid] <= 0.31 + 0.1).all()
+    wide = Volume(rho.float(), torch.full((retina.count,), math.inf))
+    free = match_sweep(*images, room.rig, room.camera, retina)[1]
+    assert torch.equal(match_sweep(*images, room.rig, room.camera, retina, volume=wide)[1].valid, free.valid)
+
+
+def test_a_rectified_pair_with_different_centres():
+    """Truth: a plane at 2 m; the right camera's axis is 7 px aside, and the retinas look off centre."""
+    focal, baseline, size = 180.0, 0.2, (120, 160)
+    left_camera, right_camera = Pinhole(focal, 82.0, 60.5), Pinhole(focal, 89.0, 60.5)
+    y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in size), indexing="ij")
+    images = []
+    for camera, shift in ((left_camera, 0.0), (right_camera, baseline)):
+        point = 2.0 * camera.rays(torch.stack([x, y], -1))
+        point[..., 0] += shift
+        images.append(texture(point)[None])
+    retina = LogPolar(2000)
+    match = match_sweep_rectified(*images, left_camera, right_camera, baseline, retina, gaze_px=(70.0, 55.0))
+    true = focal * baseline / 2.0 - 7.0
+    found = match.correspondences
+    scale = 120 / 200
+    shift = ((found.left_px - found.right_px)[:, 0] * scale)[found.valid]
+    assert found.valid.double().mean() > 0.6
+    assert (shift - true).abs().median() < 0.2  # RFs are at least 1 px wide
+    assert match.camera_left.focal_px == pytest.approx(focal / scale)
+    dense = match.disparity
+    assert dense.disparity.shape == size
+    assert (dense.depth_m()[dense.valid] - 2.0).abs().median() < 0.05
+    with pytest.raises(SettingError, match="camera_right"):
+        match_sweep_rectified(*images, left_camera, Pinhole(focal, 89.0, 61.0), baseline, retina)
+    with pytest.raises(SettingError, match="baseline_m"):
+        match_sweep_rectified(*images, left_camera, right_camera, 0.0, retina)
+
+
+def test_batch_is_a_loop_and_rotations_may_be_batched():
+    rooms = [Room([WALL], vergence=0.1), Room([WALL, BOARD], vergence=0.2, seed=3)]
+    retina = LogPolar(1200)
+    images = [torch.stack(side) for side in zip(*(room.images(64) for room in rooms), strict=True)]
+    rig = StereoRig(*(torch.stack([room.rig[k] for room in rooms]) for k in (0, 1)), BASELINE_M)
+    together, _ = match_sweep(*images, rig, rooms[0].camera, retina)
+    for k, room in enumerate(rooms):
+        # the densest hypotheses of either pair serve both: equal up to that
+        alone, _ = match_sweep(images[0][k], images[1][k], room.rig, room.camera, retina)
+        both = alone.valid & together.valid[k]
+        assert (alone.valid == together.valid[k]).double().mean() > 0.9
+        assert (alone.right_px - together.right_px[k]).norm(dim=-1)[both].median() < 0.1
+    same = StereoRig(*(torch.stack([rooms[0].rig[k]] * 2) for k in (0, 1)), BASELINE_M)
+    twice = [torch.stack([image] * 2) for image in rooms[0].images(64)]
+    pair, _ = match_sweep(*twice, same, rooms[0].camera, retina)
+    one, _ = match_sweep(twice[0][0], twice[1][0], rooms[0].rig, rooms[0].camera, retina)
+    for many, single in zip(pair, one, strict=True):
+        torch.testing.assert_close(many[1], single)
+
+
+def test_precision_and_colour(dtype):
+    room = Room([WALL])
+    left, right = (i.to(dtype) for i in room.images(96))
+    retina = LogPolar(1200)
+    grey, found = match_sweep(left, right, room.rig, room.camera, retina)
+    assert all(t.dtype == dtype for t in (*grey[:4], *found[:3]))
+    assert grey.valid.double().mean() > 0.6
+    colour, _ = match_sweep(left.expand(3, -1, -1), right.expand(3, -1, -1), room.rig, room.camera, retina)
+    assert (colour.valid == grey.valid).double().mean() > 0.99
+    bytes_ = [(i * 255).round().byte().numpy() for i in (left, right)]
+    eight, _ = match_sweep(*bytes_, room.rig, room.camera, retina)
+    assert (eight.valid == grey.valid).double().mean() > 0.95
+
+
+def test_a_posed_rig_equals_a_verged_one():
+    room = Room([WALL])
+    R_left, R_right = room.rig[:2]
+    other = posed(R_left.T @ R_right, R_left.T @ torch.tensor([BASELINE_M, 0.0, 0.0], dtype=torch.float64))
+    images, retina = room.images(96), Uniform(800)
+    a, b = (match_sweep(*images, rig, room.camera, retina)[0] for rig in (room.rig, other))
+    torch.testing.assert_close(a.right_px, b.right_px, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("retina", [LogPolar(120, rho_min_px=8.0), Uniform(120)], ids=["log_polar", "uniform"])
+def test_differentiable_from_images_to_gaussians(retina):
+    room = Room([WALL], vergence=0.1)
+    left, right = room.images(24)
+    origin = [room.eye(k)[0] for k in (0, 1)]
+    eyes = Eyes(room.rig.R_left, origin[0], room.rig.R_right, origin[1])
+    support = retina.width_px(retina.centers_px(dtype=torch.float64)) / 2
+
+    def gaussians(left, right):
+        matches, found = match_sweep(left, right, room.rig, room.camera, retina)
+        seen = observe(matches, eyes, room.camera, support)
+        keep = seen.valid
+        return seen.mean[keep], seen.cov[keep] * 1e3, found.inverse_range[keep], found.sigma[keep]
+
+    inputs = [i.clamp(0.02, 0.98).requires_grad_() for i in (left, right)]
+    outputs = gaussians(*inputs)
+    assert len(outputs[0]) > 20
+    assert torch.autograd.gradcheck(gaussians, inputs, eps=1e-7, atol=1e-4, rtol=1e-3, fast_mode=True)
+    gradients = torch.autograd.grad(sum(o.sum() for o in gaussians(*inputs)), inputs)
+    assert all(g.isfinite().all() and g.abs().sum() > 0 for g in gradients)
+
+
+@pytest.mark.parametrize("image", [torch.full((1, 64, 64), 0.4), torch.zeros(1, 64, 64)], ids=["grey", "black"])
+def test_without_texture_nothing_is_valid(image):
+    room = Room([WALL])
+    retina = LogPolar(600)
+    image = image.clone().requires_grad_()
+    matches, found = match_sweep(image, image, room.rig, room.camera, retina)
+    assert not matches.valid.any()
+    assert all(t.isfinite().all() for t in (*matches[:4], *found[:3]))
+    origin = [room.eye(k)[0].float() for k in (0, 1)]
+    eyes = Eyes(room.rig.R_left.float(), origin[0], room.rig.R_right.float(), origin[1])
+    seen = observe(matches, eyes, room.camera, retina.width_px(matches.left_px) / 2)
+    assert not seen.valid.any()
+    assert seen.mean.isfinite().all() and seen.cov.isfinite().all()
+    gradient = torch.autograd.grad(matches.right_px.sum() + matches.right_sigma_px.sum(), image)[0]
+    assert (gradient == 0).all()
+
+
+def test_unrelated_images_match_nowhere():
+    generator = torch.Generator().manual_seed(0)
+    left, right = torch.rand(2, 1, 120, 120, generator=generator)
+    matches, _ = match_sweep(left, right, verged(0.1, 0.2), Pinhole.from_fov(90.0, 100.0), LogPolar(2000))
+    assert matches.valid.double().mean() < 0.5
+    assert all(t.isfinite().all() for t in matches[:4])
+
+
+def test_bad_input_is_named():
+    camera, retina, rig = Pinhole.from_fov(90.0, 100.0), LogPolar(600), verged(0.1, 0.2)
+    good = torch.rand(1, 64, 64)
+    bad = good.clone()
+    bad[0, 3, 3] = torch.nan
+    cases = [
+        ((bad, good), {}, "left = NaN"),
+        ((good, bad), {}, "right = NaN"),
+        ((good, good[:, :32]), {}, "right.shape"),
+        ((good[0], good[0]), {}, "left.shape"),
+        ((good[:, :4], good[:, :4]), {}, "left.shape"),
+        ((good * 300, good), {}, "left = "),
+        ((good.long(), good), {}, "left.dtype"),
+        ((good, good), {"nearest_range_m": 0.0}, "nearest_range_m"),
+        ((good, good), {"farthest_range_m": 0.2}, "farthest_range_m"),
+        ((good, good), {"volume": Volume(torch.ones(3), torch.ones(3))}, "volume.inverse_range.shape"),
+        ((good, good), {"volume": Volume(torch.ones(retina.count), torch.zeros(retina.count))}, "volume.sigma"),
+        ((good, good), {"volume": Volume(torch.full((retina.count,), torch.nan), torch.ones(retina.count))}, "NaN"),
+    ]
+    for images, options, message in cases:
+        with pytest.raises(SettingError, match=message):
+            match_sweep(*images, rig, camera, retina, **options)
+    for name, value in {
+        "window": 0, "refine_window": 4, "per_width": 0.0, "hypotheses": 3, "smooth_small": -1.0, "smooth_large": 0.1,
+        "correlation": 1.0, "uniqueness": -0.1, "contrast": 0.0, "noise": 0.0, "left_right_widths": 0.0,
+        "winner_widths": 0.0, "temperature": 0.0, "volume_sigmas": 0.0,
+    }.items():  # fmt: skip
+        with pytest.raises(SettingError, match=f"matcher.{name}"):
+            Sweep(**{name: value})
+
+
+@pytest.mark.parametrize("retina", [*RETINAS, LogPolar(31416), Uniform(31416), LogPolar(300)], ids=str)
+@pytest.mark.parametrize("pitch", [0.5, 3.0])
+def test_sheets_hold_every_rf_once_at_its_place(retina, pitch):
+    cut = sheets(retina, pitch, torch.device("cpu"), torch.float64)
+    assert torch.equal(torch.cat([s.rf for s in cut]).sort().values, torch.arange(retina.count))
+    for sheet in cut:
+        one = torch.ones(1, *sheet.width_px.shape, dtype=torch.float64)
+        px, found = read_sheet(sheet, sheet.px.movedim(-1, 0)[None], 0 * one, one > 0, one)
+        assert found.all()
+        centers = retina.centers_px(dtype=torch.float64)[sheet.rf]
+        torch.testing.assert_close(px[0].T, centers, atol=1e-4, rtol=0)
+        assert (sheet.width_px >= pitch).all()
+        width, _ = read_sheet(sheet, sheet.width_px[None, None], 0 * one, one > 0, one)
+        torch.testing.assert_close(width[0, 0], retina.width_px(centers).clamp(min=pitch), rtol=0.1, atol=0)
+
+
+def test_sheets_do_not_average_over_edges():
+    sheet = sheets(LogPolar(3000), 0.5, torch.device("cpu"), torch.float64)[0]
+    values = (sheet.px[..., 0] > 0).double()[None]
+    valid = torch.ones_like(values) > 0
+    limit = torch.full_like(values, 0.5)
+    out, found = read_sheet(sheet, values[:, None], values, valid, limit)
+    assert found.all()
+    assert set(out.unique().tolist()) == {0.0, 1.0}
+    out, found = read_sheet(sheet, values[:, None], values, values > 0, limit)
+    assert (out[:, 0][found] == 1).all() and (out[:, 0][~found] == 0).all()
+
+
+@pytest.mark.parametrize("radius", [1, 2, 3])
+@pytest.mark.parametrize("closed", [False, True])
+def test_average_is_repeated_convolution(radius, closed, generator):
+    values = torch.rand(2, 7, 9, generator=generator, dtype=torch.float64)
+    expected = values.numpy()
+    kernel = np.ones((1, 3, 1)) / 3
+    for _ in range(radius):
+        expected = convolve(expected, kernel, mode="nearest")
+        expected = convolve(expected, kernel.transpose(0, 2, 1), mode="wrap" if closed else "nearest")
+    np.testing.assert_allclose(average(values, radius, closed).numpy(), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("retina", RETINAS, ids=IDS)
+def test_nearest_rf(retina, generator):
+    px = 140 * (torch.rand(500, 2, generator=generator, dtype=torch.float64) - 0.5)
+    centers = retina.centers_px(dtype=torch.float64)
+    found = (px - centers[nearest_rf(retina, 0.5, px)]).norm(dim=-1)
+    best = (px[:, None] - centers).norm(dim=-1).amin(1)
+    assert (found <= best + 0.5).all()
+
+
+def aggregate_by_loops(cost, values, small, large, contrast):
+    """Hirschmüller's recursion on one (D, R, S) volume, written out."""
+    depth, rows, columns = cost.shape
+    total = np.zeros_like(cost)
+    for dr, dc in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        passed = np.zeros_like(cost)
+        for r in range(rows)[:: dr or 1]:
+            for c in range(columns)[:: dc or 1]:
+                p, q = r - dr, c - dc
+                passed[:, r, c] = cost[:, r, c]
+                if 0 <= p < rows and 0 <= q < columns:
+                    last = passed[:, p, q]
+                    bound = max(large / (1 + abs(values[r, c] - values[p, q]) / contrast), small)
+                    for d in range(depth):
+                        near = [last[d]] + [last[e] + small for e in (d - 1, d + 1) if 0 <= e < depth]
+                        passed[d, r, c] += min(*near, last.min() + bound) - last.min()
+        total += passed / 4
+    return total
+
+
+def test_aggregation_against_loops(generator):
+    cost = torch.rand(2, 6, 8, 10, generator=generator, dtype=torch.float64)
+    values = torch.rand(2, 8, 10, generator=generator, dtype=torch.float64)
+    out = aggregate(cost, values, False, 0.1, 0.6, 0.3)
+    for b in range(2):
+        expected = aggregate_by_loops(cost[b].numpy(), values[b].numpy(), 0.1, 0.6, 0.3)
+        np.testing.assert_allclose(out[:, b].numpy(), expected, atol=1e-12)
+
+
+def test_aggregation_in_segments_is_nearly_the_whole(generator):
+    cost = torch.rand(1, 8, 3, 230, generator=generator, dtype=torch.float64)
+    values = torch.rand(1, 3, 230, generator=generator, dtype=torch.float64)
+    expected = aggregate_by_loops(cost[0].numpy(), values[0].numpy(), 0.2, 1.0, 0.2)
+    out = aggregate(cost, values, False, 0.2, 1.0, 0.2)[:, 0].numpy()
+    # paths forget: the first steps of a whole line have no predecessor, a segment's have a copy
+    np.testing.assert_allclose(out[..., 12:-12], expected[..., 12:-12], atol=0.02)
+
+
+def test_aggregation_on_a_closed_grid_has_no_seam(generator):
+    cost = torch.rand(1, 5, 4, 96, generator=generator, dtype=torch.float64)
+    values = torch.rand(1, 4, 96, generator=generator, dtype=torch.float64)
+    out = aggregate(cost, values, True, 0.2, 1.0, 0.2)
+    turned = aggregate(cost.roll(48, -1), values.roll(48, -1), True, 0.2, 1.0, 0.2)
+    torch.testing.assert_close(turned, out.roll(48, -1))

@@ -1,0 +1,103 @@
+"""Disparity maps, and their confidences, from files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchfovea.setting import SettingError, require
+
+__all__ = ["check_maps", "load_disparity"]
+
+
+def load_disparity(path: str | Path, setting: str = "matcher.source") -> tuple[Tensor, Tensor | None]:
+    """A disparity map, and its confidence where the file has one.
+
+    Args:
+        path: NPZ with `disparity` (or one array alone) and perhaps `confidence`; NPY; PFM; or 16-bit PNG in 1/256 px
+            with 0 for unknown (KITTI's).
+        setting: the name the user knows the path by.
+
+    Returns:
+        (H, W) float32 [px], not finite where unknown; and (H, W) in [0, 1], or None.
+
+    Raises:
+        SettingError: for a file that is missing, of another form, or whose parts do not fit.
+    """
+    path = Path(path)
+    require(path.is_file(), setting, path, "an existing file")
+    suffix = path.suffix.lower()
+    readers = {".npz": _npz, ".npy": _npy, ".pfm": _pfm, ".png": _png}
+    require(suffix in readers, setting, path, "a file that ends in .npz, .npy, .pfm or .png")
+    try:
+        disparity, confidence = readers[suffix](path)
+    except SettingError:
+        raise
+    except (ValueError, OSError, IndexError, EOFError) as error:
+        raise SettingError(f"{setting} = {path}: expected a disparity map ({error})") from error
+    return check_maps(disparity, confidence, None, f"{setting} = {path}")
+
+
+def _npz(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    with np.load(path, allow_pickle=False) as file:
+        names = file.files
+        key = "disparity" if "disparity" in names else names[0] if len(names) == 1 else None
+        if key is None:
+            raise ValueError(f"it holds {', '.join(names) or 'nothing'}, and no disparity")
+        return file[key], file["confidence"] if "confidence" in names else None
+
+
+def _npy(path: Path) -> tuple[np.ndarray, None]:
+    return np.load(path, allow_pickle=False), None
+
+
+def _pfm(path: Path) -> tuple[np.ndarray, None]:
+    with path.open("rb") as file:
+        kind, size, scale = (file.readline().decode("ascii", "replace").split() for _ in range(3))
+        if kind != ["Pf"]:
+            raise ValueError("it is no grey PFM")
+        width, height = map(int, size)
+        values = np.frombuffer(file.read(4 * width * height), "<f4" if float(scale[0]) < 0 else ">f4")
+    return values.reshape(height, width)[::-1].astype(np.float32), None
+
+
+def _png(path: Path) -> tuple[np.ndarray, None]:
+    try:
+        import cv2
+    except ImportError as error:
+        raise SettingError(
+            f"{path}: expected OpenCV, which comes with pip install 'torchfovea[stereo]', to read a PNG"
+        ) from error
+    values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if values is None or values.dtype != np.uint16:
+        raise ValueError("it is no PNG of 16 bits")
+    return np.where(values == 0, np.nan, values / np.float32(256)), None
+
+
+def check_maps(
+    disparity: Any, confidence: Any, size: tuple[int, int] | None, where: str
+) -> tuple[Tensor, Tensor | None]:
+    """A matcher's answer as float32 tensors.
+
+    Raises:
+        SettingError: unless the disparity is (H, W) numbers, of the given size if any, and the confidence is alike, in
+            [0, 1].
+    """
+    maps: list[Tensor] = []
+    for name, value in (("disparity", disparity), ("confidence", confidence)):
+        if value is None and name == "confidence":
+            return maps[0], None
+        array = np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
+        expected = "(H, W)" if size is None else str(size)
+        fits = array.ndim == 2 and array.size > 0 and (size is None or array.shape == size)
+        require(fits, f"{where}: {name}.shape", array.shape, expected)
+        require(array.dtype.kind in "fiu", f"{where}: {name}.dtype", array.dtype, "numbers")
+        maps.append(torch.from_numpy(np.array(array, dtype=np.float32, order="C")))
+        size = array.shape
+    bounded = bool(((maps[1] >= 0) & (maps[1] <= 1)).all())
+    require(bounded, f"{where}: confidence", f"{maps[1].min():g} to {maps[1].max():g}", "0 to 1")
+    return maps[0], maps[1]
