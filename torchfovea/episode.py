@@ -115,17 +115,13 @@ def run_episode(
 
     def show(t: int, look: Look, step: Step) -> None:
         if each is not None:
-            each(t, Look(row(look.matches, 0), look.pictures[0]), row(step, 0)._replace(mind=one(step.mind)))
-
-    def one(batch: Mind) -> Mind:
-        return Mind(row(batch.memory, 0), mind.lookup, batch.spacing_rad[0])
+            each(t, Look(row(look.matches, 0), look.pictures[0]), _step_of(step, 0))
 
     alone = Mind(stack([mind.memory]), mind.lookup, mind.spacing_rad[None])
     episode = run_episodes(
         observer, alone, Together([arena]), [truth], saccades, [generator], far_m, near_target_m, show, stop
     )[0]
-    step = episode.step._replace(mind=Mind(episode.step.mind.memory, mind.lookup, mind.spacing_rad))
-    return episode._replace(step=step, look=Look(episode.look.matches, episode.look.pictures[0]))
+    return episode._replace(look=Look(episode.look.matches, episode.look.pictures[0]))
 
 
 def run_episodes(
@@ -221,7 +217,7 @@ def run_episodes(
     episodes = []
     for b, truth in enumerate(truths):
         best = torch.tensor(-truth.nearest_m, dtype=torch.float64)
-        own = row(step, b)
+        own = _step_of(step, b)
         episodes.append(
             Episode(
                 gaze=Gaze(*(angle[b] for angle in gazes)),
@@ -244,6 +240,13 @@ def run_episodes(
             )
         )
     return episodes
+
+
+def _step_of(step: Step, b: int) -> Step:
+    """One episode's part of a step; the index of the cells stays that of the batch."""
+    mind = step.mind
+    kept = row(step._replace(mind=None, state=None), b)  # type: ignore[arg-type]
+    return kept._replace(mind=Mind(row(mind.memory, b), mind.lookup, mind.spacing_rad[b]))
 
 
 def _target_error(step: Step, truth: Truth) -> float | None:
