@@ -35,35 +35,28 @@ def aggregate(cost: Tensor, values: Tensor, closed: bool, small: float, large: f
         (D, B, R, S). Not differentiable.
     """
     batch, depth, rows, columns = cost.shape
-    total: Tensor | None = None
+    total = torch.zeros(depth, batch, rows, columns, dtype=cost.dtype, device=cost.device)
     for dim, around in ((2, False), (3, closed)):
         size, other = cost.shape[dim], rows * columns // cost.shape[dim]
         line = cost.movedim(dim, 0).transpose(1, 2).reshape(size, depth, batch * other)
         image = values.movedim(dim - 1, 0).reshape(size, batch * other)
-        out = torch.zeros_like(line)
         parts = max(1, round(size / SEGMENT))
         length = math.ceil(size / parts) + (RUN_IN if around or parts > 1 else 0)
-        borders = [k * size // parts for k in range(parts + 1)]
         back = torch.arange(-length, 0, device=cost.device)
-        # what one step handles is contiguous: (T, D, parts · lines)
-        costs = cost.new_empty(length, depth, parts, batch * other)
-        shades = cost.new_empty(length, parts, batch * other)
-        for forward in (True, False):
-            ways = []
-            for k, (start, end) in enumerate(pairwise(borders)):
-                way = end + back if forward else start - 1 - back
-                ways.append(way % size if around else way.clamp(0, size - 1))
-                costs[:, :, k] = line[ways[-1]]
-                shades[:, k] = image[ways[-1]]
-            bound = (large / (1 + (shades[1:] - shades[:-1]).abs() / contrast)).clamp(min=small)
-            _pass(costs.flatten(2), bound.flatten(1), small)
-            for k, way in enumerate(ways):
-                kept = borders[k + 1] - borders[k]
-                out.index_add_(0, way[-kept:], costs[-kept:, :, k])
-        # (size, D, B, other) to (D, B, R, S)
-        out = out.unflatten(-1, (batch, other)).permute(1, 2, *((0, 3) if dim == 2 else (3, 0)))
-        total = out.contiguous() if total is None else total.add_(out)
-    assert total is not None
+        # each segment [start, end) forward and backward; what one step handles is contiguous: (T, D, 2 parts, lines)
+        segments = list(pairwise(k * size // parts for k in range(parts + 1)))
+        ways = [way for start, end in segments for way in (end + back, start - 1 - back)]
+        costs = cost.new_empty(length, depth, len(ways), batch * other)
+        shades = cost.new_empty(length, len(ways), batch * other)
+        for k, way in enumerate(ways):
+            place = way % size if around else way.clamp(0, size - 1)
+            costs[:, :, k], shades[:, k] = line[place], image[place]
+        bound = (large / (1 + (shades[1:] - shades[:-1]).abs() / contrast)).clamp_(min=small)
+        _pass(costs.flatten(2), bound.flatten(1), small)
+        out = total.permute(2, 0, 1, 3) if dim == 2 else total.permute(3, 0, 1, 2)
+        for k, (start, end) in enumerate(segments):
+            forward, backward = costs[start - end :, :, 2 * k], costs[start - end :, :, 2 * k + 1].flip(0)
+            out[start:end] += backward.add_(forward).unflatten(-1, (batch, other))
     return total.mul_(0.25)
 
 

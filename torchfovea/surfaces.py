@@ -53,7 +53,7 @@ class Sweep:
     contrast: float = 0.2
     noise: float = 0.004
     uniqueness: float = 0.05
-    correlation: float = 0.4
+    correlation: float = 0.5
     left_right_widths: float = 1.0
     winner_widths: float = 0.2
     temperature: float = 1.0
@@ -152,11 +152,13 @@ def win(eye: Eye, sheet: Sheet, params: Sweep, low: Tensor, high: Tensor) -> Win
     total = aggregate(cost, own.values[:, 0], sheet.closed, params.smooth_small, params.smooth_large, params.contrast)
     best = total.amin(0)
     index = torch.arange(len(rho), device=rho.device, dtype=torch.int16)[:, None, None, None]
-    win = torch.where(total == best, index, len(rho)).amin(0)
-    rival = torch.where((index - win).abs() <= 2, math.inf, total).amin(0)
-    clear = rival - best >= params.uniqueness * best
-    win = win.long().clamp(1, len(rho) - 2)
-    before, here, after = (total.gather(0, (win + k)[None])[0] for k in (-1, 0, 1))
+    win = torch.where(total == best, index, len(rho)).amin(0).long()
+    inner = win.clamp(1, len(rho) - 2)
+    before, here, after = (total.gather(0, (inner + k)[None])[0] for k in (-1, 0, 1))
+    for k in range(-2, 3):  # what is left are other surfaces
+        total.scatter_(0, (win + k).clamp(0, len(rho) - 1)[None], math.inf)
+    clear = total.amin(0) - best >= params.uniqueness * best
+    win = inner
     bend = before - 2 * here + after
     part = torch.where(bend > 0, (before - after) / (2 * bend.clamp(min=1e-9)), torch.zeros_like(bend))
     part = (4 * part.clamp(-0.5, 0.5)).round() / 4
