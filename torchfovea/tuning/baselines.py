@@ -41,7 +41,9 @@ def _centre(azimuth_deg: Tensor, elevation_deg: Tensor) -> Tensor:
     return torch.stack((a.cos() * e.cos(), a.sin() * e.cos(), e.sin()), -1)
 
 
-def hand(problem: Problem, alpha: float = 1.0, scenes: int = 512, sigmas: tuple[float, ...] = _SIGMAS) -> tuple[Tensor, float]:
+def hand(
+    problem: Problem, alpha: float = 1.0, scenes: int = 512, sigmas: tuple[float, ...] = _SIGMAS
+) -> tuple[Tensor, float]:
     """One isotropic Gaussian on each region's centre, all with the σ that is best on validation scenes.
 
     It knows the distribution's own definition; for a conditioned one its means follow the task, by least squares.
@@ -55,8 +57,10 @@ def hand(problem: Problem, alpha: float = 1.0, scenes: int = 512, sigmas: tuple[
     shape, distribution = problem.shape, problem.distribution
     scored = []
     for sigma in sigmas:
-        vector = _conditioned_hand(shape, distribution, sigma, alpha) if shape.conditioned else _plain_hand(
-            shape, distribution, sigma, alpha
+        vector = (
+            _conditioned_hand(shape, distribution, sigma, alpha)
+            if shape.conditioned
+            else _plain_hand(shape, distribution, sigma, alpha)
         )
         scored.append((float(evaluate(problem, vector, scenes, stream("validation", 0)).mean()), sigma, vector))
     _, sigma, vector = max(scored, key=lambda item: item[0])
@@ -160,7 +164,9 @@ def tpe(problem: Problem, start: Tensor, episodes: int, seed: int, per_evaluatio
     while spent < episodes:
         trial = study.ask()
         bounds = zip(low.tolist(), high.tolist(), strict=True)
-        vector = torch.tensor([trial.suggest_float(f"x{i}", a, b) for i, (a, b) in enumerate(bounds)], dtype=torch.float64)
+        vector = torch.tensor(
+            [trial.suggest_float(f"x{i}", a, b) for i, (a, b) in enumerate(bounds)], dtype=torch.float64
+        )
         try:
             study.tell(trial, objective(vector, key))
         except SettingError:
@@ -170,7 +176,9 @@ def tpe(problem: Problem, start: Tensor, episodes: int, seed: int, per_evaluatio
         yield spent, torch.tensor([best[f"x{i}"] for i in range(len(low))], dtype=torch.float64)
 
 
-def finite_differences(problem: Problem, start: Tensor, episodes: int, seed: int, per_evaluation: int = 4) -> Incumbents:
+def finite_differences(
+    problem: Problem, start: Tensor, episodes: int, seed: int, per_evaluation: int = 4
+) -> Incumbents:
     """Adam on central differences with common random numbers, one number after the other."""
     vector = fix_vector(problem.shape, start)
     objective, spent, key = _objective(problem, seed, per_evaluation), 0, 0

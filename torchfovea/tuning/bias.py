@@ -1,4 +1,4 @@
-"""The numbers that are tuned: a flat vector, what mixture and exploration weight it stands for, and cells drawn from it."""
+"""The numbers that are tuned: a flat vector, the mixture and α that it stands for, and cells drawn from it."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from torchfovea.setting import require
 from torchfovea.sphere import DirectionMixture, Quadrature, _log_moment, _tail, fix_gauge
 
 __all__ = [
-    "Bias", "Shape", "decode", "draw_cells", "encode", "features", "fix_vector", "log_density_each", "log_normalizer_each",
-    "mixture_of", "reachable",
+    "Bias", "Shape", "decode", "draw_cells", "encode", "features", "fix_vector", "log_density_each",
+    "log_normalizer_each", "mixture_of", "reachable",
 ]  # fmt: skip
 
 REACH_RANGE_M = 1.0  # as in `torchfovea.experiments.build`: a direction is reachable if its point at 1 m is
@@ -125,7 +125,8 @@ def encode(shape: Shape, mixture: DirectionMixture, alpha: float) -> Tensor:
     require(alpha > 0 and abs(math.log(alpha)) <= 4, "acquisition.alpha", alpha, "between 0.0183 and 54.6 at the start")
     mixture = fix_gauge(DirectionMixture(*(t.double() for t in mixture)))
     which = torch.arange(m) % given
-    apart = torch.randn(m, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * (0.3 if m > given else 0)
+    noise = torch.Generator().manual_seed(0)
+    apart = torch.randn(m, 3, generator=noise, dtype=torch.float64) * (0.3 if m > given else 0)
     means = mixture.means[which] + apart * (torch.arange(m) >= given)[:, None]
     factor = mixture.cholesky[which]
     diagonal = factor.diagonal(dim1=-2, dim2=-1).log().clamp(*_LOG_DIAGONAL)
@@ -176,9 +177,7 @@ def draw_cells(bias: Bias, scenes: int, cells: int, head: Head, generator: torch
         SettingError: where fewer than one draw in a thousand is reachable.
     """
     dtype = bias.means.dtype
-    logits, means, factor = (
-        t.detach().expand(scenes, *t.shape[1:]) for t in (bias.logits, bias.means, bias.cholesky)
-    )
+    logits, means, factor = (t.detach().expand(scenes, *t.shape[1:]) for t in (bias.logits, bias.means, bias.cholesky))
     edges = logits.softmax(-1).cumsum(-1)
     direction = torch.zeros(scenes, cells, 3, dtype=dtype)
     waiting = torch.arange(scenes * cells)

@@ -1,10 +1,10 @@
 """Gradients from candidate directions that are played against a finished run, with all other cells frozen.
 
-- `insertion`: N − 1 cells are played; then candidate directions, drawn from a mixture of p̃ and the uniform density, are
-  each played against that run: the candidate's belief, its fixations and the delay that they cause are followed; only what
-  its own looks teach about *other* cells is left out. Nearly exact and cheap, but not unbiased.
-- `corrected`: `insertion` plus exact runs of a few candidates, importance-sampled, with the frozen value as control variate.
-  Unbiased.
+- `insertion`: N − 1 cells are played; then candidate directions, drawn from a mixture of p̃ and the uniform density,
+  are each played against that run: the candidate's belief, its fixations and the delay that they cause are followed;
+  only what its own looks teach about *other* cells is left out. Nearly exact and cheap, but not unbiased.
+- `corrected`: `insertion` plus exact runs of a few candidates, importance-sampled, with the frozen value as control
+  variate. Unbiased.
 - `myopic`: density-weighted, all-action, through a softmax policy; its fixed point is wrong.
 """
 
@@ -32,7 +32,8 @@ _TEMPERATURE = 0.1
 class _Frozen(NamedTuple):
     """Candidates (B, Q) played against a base run.
 
-    weight: importance weight times N/Q; advantage: frozen gain; made: decisions before the first fixation (T − 1: never);
+    weight: importance weight times N/Q; advantage: frozen gain; made: decisions before the first fixation (T − 1:
+    never);
     memory: at that decision.
     """
 
@@ -178,8 +179,8 @@ def _exact(problem: Problem, bias: Bias, batch: Batch, frozen: _Frozen, scene: T
 def myopic(problem: Problem, vector: Tensor, batch: Batch, alpha_share: float = 0.5, candidates: int = 200) -> Gradient:
     """The next fixation's gain under a softmax over density-weighted candidates, as if it lasted to the end.
 
-    Σ_t (T − t)/T ∇ E_π[Δg], π ∝ p̃(u) exp(score/τ): of low variance and right at first, but a gain now is not charged for
-    the gains that it makes impossible later, and the softmax hardly ever lacks a good cell.
+    Σ_t (T − t)/T ∇ E_π[Δg], π ∝ p̃(u) exp(score/τ): of low variance and right at first, but a gain now is not charged
+    for the gains that it makes impossible later, and the softmax hardly ever lacks a good cell.
     """
     task, n = problem.task, len(batch.scenes.nearest_m)
     bias = problem.bias(vector.detach(), batch.scenes)
@@ -197,6 +198,4 @@ def myopic(problem: Problem, vector: Tensor, batch: Batch, alpha_share: float = 
     scene, which = torch.ones_like(total, dtype=torch.bool).nonzero(as_tuple=True)
     credit = Credit(scene, frozen.world.direction[scene, which], total[scene, which])
     spent = n * (1 + candidates / problem.cells)
-    return finish(
-        problem, vector, batch, frozen.base_world, [credit], frozen.base.value, spent, n, alpha_share
-    )
+    return finish(problem, vector, batch, frozen.base_world, [credit], frozen.base.value, spent, n, alpha_share)

@@ -1,15 +1,15 @@
 """Estimators of the gradient of the expected gap per saccade with respect to the tuned vector.
 
-A gradient credits directions: Σ_j w_j ∇ log p̃(u_j), with p̃ the cells' density restricted to the reachable set. Cells are
-drawn independently, so that E[∇ log p̃(p_i) f] = 0 for any f that does not look at cell i.
+A gradient credits directions: Σ_j w_j ∇ log p̃(u_j), with p̃ the cells' density restricted to the reachable set. Cells
+are drawn independently, so that E[∇ log p̃(p_i) f] = 0 for any f that does not look at cell i.
 
-- `counterfactual`: w_i = R(P) − R(P∖p_i) for every fixated cell. *Unbiased* for the hard argmax policy, for removing a cell
-  changes no other cell's observations here, and a cell that is never fixated has w_i = 0 exactly. Each fixated cell costs a
-  run from its first fixation on.
-- `covered`: the same with an analytic control variate. Let f(P) be the value of the best can that any cell falls on. Its
-  expectation over cells, F = Σ_c v_c [(1 − m_1 − … − m_{c−1})^N − (1 − m_1 − … − m_c)^N] with m_c = ∫_can p̃, has an exact
-  gradient without any luck of the draw, and f has counterfactuals without any run, so that ∇F plus the counterfactual of
-  R − f is unbiased too (but for the quadrature of m).
+- `counterfactual`: w_i = R(P) − R(P∖p_i) for every fixated cell. *Unbiased* for the hard argmax policy, for removing a
+  cell changes no other cell's observations here, and a cell that is never fixated has w_i = 0 exactly. Each fixated
+  cell costs a run from its first fixation on.
+- `covered`: the same with an analytic control variate. Let f(P) be the value of the best can that any cell falls on.
+  Its expectation over cells, F = Σ_c v_c [(1 − m_1 − … − m_{c−1})^N − (1 − m_1 − … − m_c)^N] with m_c = ∫_can p̃, has
+  an exact gradient without any luck of the draw, and f has counterfactuals without any run, so that ∇F plus the
+  counterfactual of R − f is unbiased too (but for the quadrature of m).
 - `coverage`: ∇F alone: no run at all. Biased, for F knows cells but no saccades; a warm start.
 
 α is not in p̃: its derivative is a central difference of log α with common random numbers.
@@ -17,13 +17,11 @@ drawn independently, so that E[∇ log p̃(p_i) f] = 0 for any f that does not l
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchfovea.metrics import gap
 from torchfovea.tuning.bias import Bias, log_density_each, log_normalizer_each
 from torchfovea.tuning.problem import Batch, Problem, prepare
 from torchfovea.tuning.scenes import Scenes, cast, nearest_point
@@ -79,24 +77,28 @@ def pull(problem: Problem, vector: Tensor, batch: Batch, credits: list[Credit]) 
     return torch.autograd.grad(total / n, x)[0].double()
 
 
-def alpha_difference(problem: Problem, vector: Tensor, batch: Batch, world: World, share: float = 1.0) -> tuple[float, float]:
-    """d J/d log α by a central difference on the same cells, scenes and noise; and the episodes spent."""
+def alpha_difference(
+    problem: Problem, vector: Tensor, batch: Batch, world: World, share: float = 1.0
+) -> tuple[float, float]:
+    """Slope in log α by a central difference on the same cells, scenes and noise; and the episodes spent."""
     if not problem.shape.tune_alpha or share <= 0:
         return 0.0, 0.0
     n = max(1, round(share * len(batch.scenes.nearest_m)))
     part = torch.arange(n)
     scenes, world = batch.scenes.take(part), world.take(part)
     alpha = problem.bias(vector.detach(), batch.scenes).alpha
-    high, low = (
-        simulate(problem.task, scenes, world, alpha * math.exp(h)).value.mean() for h in (_ALPHA_STEP, -_ALPHA_STEP)
-    )
-    return float((high - low) / (2 * _ALPHA_STEP)), 2.0 * n
+    both = torch.cat((part, part))
+    sign = torch.ones(n).to(world.range_m)
+    alphas = alpha * torch.cat((sign, -sign)).mul(_ALPHA_STEP).exp()
+    value = simulate(problem.task, scenes.take(both), world.take(both), alphas).value
+    return float((value[:n] - value[n:]).mean() / (2 * _ALPHA_STEP)), 2.0 * n
 
 
 def finish(
     problem: Problem, vector: Tensor, batch: Batch, world: World, credits: list[Credit], value: Tensor, episodes: float,
     runs: int, alpha_share: float,
 ) -> Gradient:  # fmt: skip
+    """Turn credits into a gradient, and add the slope in log α."""
     gradient = pull(problem, vector, batch, credits)
     slope, spent = alpha_difference(problem, vector, batch, world, alpha_share)
     if problem.shape.tune_alpha:
@@ -192,7 +194,7 @@ def _coverage(problem: Problem, vector: Tensor, scenes: Scenes, value: Tensor) -
 
 
 def _on_cans(scenes: Scenes, columns: int = 6, rows: int = 9) -> tuple[Tensor, Tensor, Tensor]:
-    """Directions (B, K, 3) that tile every can's box of azimuth and height, their solid angles, and the can seen (or −1)."""
+    """Directions (B, K, 3) that tile each can's box of azimuth and height, their solid angles, the can seen (or −1)."""
     away = torch.hypot(scenes.x, scenes.y)
     azimuth = torch.atan2(scenes.y, scenes.x)
     half = torch.asin((scenes.radius / away).clamp(max=0.99))

@@ -64,7 +64,7 @@ def fit_closed_form(scenes: Scenes, direction: Tensor, far_m: float = 6.0) -> Pr
     return PriorField(direction, mean, (square - mean * mean).clamp(min=_SMALLEST_STD**2).sqrt())
 
 
-def fit_by_gradient(scenes: Scenes, direction: Tensor, far_m: float = 6.0, steps: int = 200) -> PriorField:
+def fit_by_gradient(scenes: Scenes, direction: Tensor, far_m: float = 6.0, steps: int = 100) -> PriorField:
     """Maximum likelihood of independent Gaussians, with Adam, in the interpolating kernel's own coefficients."""
     rho = _samples(scenes, direction, far_m)
     weight = (_SHARPNESS * (direction @ direction.mT - 1)).softmax(-1)
@@ -78,4 +78,6 @@ def fit_by_gradient(scenes: Scenes, direction: Tensor, far_m: float = 6.0, steps
         loss.backward()
         optimizer.step()
     with torch.no_grad():
-        return PriorField(direction, (weight @ mean).detach(), (weight @ log_std).exp().clamp(min=_SMALLEST_STD).detach())
+        return PriorField(
+            direction, (weight @ mean).detach(), (weight @ log_std).exp().clamp(min=_SMALLEST_STD).detach()
+        )

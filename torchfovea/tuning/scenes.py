@@ -1,7 +1,7 @@
 """Analytic scenes for tuning: upright cans in a rectangular room, drawn and ray-cast in batches, in the ego frame E.
 
-They are those of the simulated distribution of cans without poles and furniture, so that what is tuned here can be judged
-there.
+They are those of the simulated distribution of cans without poles and furniture, so that what is tuned here can be
+judged there.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ class Distribution:
 
     Attributes:
         name: for tables and pictures.
-        regions: of the target's centre as E sees it, each (azimuth low, high, elevation low, high) [deg], drawn with equal
-            probability and uniformly inside; azimuth positive to the left, elevation up.
+        regions: of the target's centre as E sees it, each (azimuth low, high, elevation low, high) [deg], drawn with
+            equal probability and uniformly inside; azimuth positive to the left, elevation up.
         conditioned: whether each scene has a task: a centre drawn from the region, told to the policy as a vector in
             [-1, 1]², with the target within `task_spread_deg` of it.
         task_spread_deg: half widths in azimuth and elevation about the task's centre [deg].
@@ -82,11 +82,14 @@ class Distribution:
             require(fine, "distribution.regions", region, "[azimuth low, high, elevation low, high] in degrees")
         require(len(regions) > 0, "distribution.regions", regions, "at least one region")
         require(
-            not self.conditioned or len(regions) == 1, "distribution.regions", regions, "one region for a conditioned family"
+            not self.conditioned or len(regions) == 1,
+            "distribution.regions",
+            regions,
+            "one region for a conditioned family",
         )
         limits = {
-            "task_spread_deg": (0, 90), "target_range_m": (0.3, 20), "azimuth_deg": (-180, 180), "elevation_deg": (-85, 85),
-            "range_m": (0.3, 20), "can_radius_m": (0.01, 0.3), "can_height_m": (0.02, 1.0),
+            "task_spread_deg": (0, 90), "target_range_m": (0.3, 20), "azimuth_deg": (-180, 180), "elevation_deg": (-85,
+            85), "range_m": (0.3, 20), "can_radius_m": (0.01, 0.3), "can_height_m": (0.02, 1.0),
         }  # fmt: skip
         for name, (low, high) in limits.items():
             pair = tuple(float(v) for v in getattr(self, name))
@@ -123,7 +126,8 @@ class Scenes(NamedTuple):
 
     def take(self, index: Tensor) -> Scenes:
         """The scenes of an index (K,)."""
-        return Scenes(*(field[index] for field in self[:7]), self.walls)
+        x, y, low, high, radius, nearest, task = (field[index] for field in self[:7])
+        return Scenes(x, y, low, high, radius, nearest, task, self.walls)
 
 
 class Hits(NamedTuple):
@@ -198,7 +202,9 @@ def draw_scenes(
         lower, upper = (bounds[:, i : i + 1].expand(n, s) for i in (0, 1))
         a = uniform((n, s), torch.where(target, lower, d.azimuth_deg[0]), torch.where(target, upper, d.azimuth_deg[1]))
         lower, upper = (bounds[:, i : i + 1].expand(n, s) for i in (2, 3))
-        e = uniform((n, s), torch.where(target, lower, d.elevation_deg[0]), torch.where(target, upper, d.elevation_deg[1]))
+        e = uniform(
+            (n, s), torch.where(target, lower, d.elevation_deg[0]), torch.where(target, upper, d.elevation_deg[1])
+        )
         r = uniform(
             (n, s),
             torch.where(target, d.target_range_m[0], d.range_m[0]).double(),
@@ -266,25 +272,20 @@ def cast(scenes: Scenes, origin: Tensor, direction: Tensor) -> Hits:
     level = torch.where(sz > 0, ceiling - oz, floor - oz) / sz
     best = torch.minimum(wall, level)
     down = (level < wall) & (sz < 0)
-    can = torch.full_like(best, -1, dtype=torch.long)
-    flat = (dx * dx + dy * dy).clamp(min=tiny)
-    infinite = torch.full_like(best, math.inf)
-    for i in range(scenes.x.shape[1]):
-        x, y, low, high, radius = (f[:, i, None] for f in scenes[:5])
-        px, py = ox - x, oy - y
-        b = px * dx + py * dy
-        c = px * px + py * py - radius * radius
-        root = b * b - flat * c
-        hits = root > 0
-        half = torch.where(hits, root, torch.ones_like(root)).sqrt()
-        entry, leave = (-b - half) / flat, (-b + half) / flat
-        z = oz + entry * dz
-        on_side = hits & (entry > 0) & (z >= low) & (z <= high)
-        cap = torch.where(sz > 0, low - oz, high - oz) / sz
-        on_cap = hits & (cap > 0) & (cap >= entry) & (cap <= leave)
-        here = torch.minimum(torch.where(on_side, entry, infinite), torch.where(on_cap, cap, infinite))
-        nearer = here < best
-        best = torch.where(nearer, here, best)
-        down = down & ~nearer
-        can = can.masked_fill(nearer, i)
-    return Hits(best, down, can)
+    flat = (dx * dx + dy * dy).clamp(min=tiny)[..., None]
+    x, y, low, high, radius = (field[:, None] for field in scenes[:5])
+    ox, oy, oz, dx, dy, dz, sz = (c[..., None] for c in (ox, oy, oz, dx, dy, dz, sz))
+    px, py = ox - x, oy - y
+    b = px * dx + py * dy
+    root = b * b - flat * (px * px + py * py - radius * radius)
+    hits = root > 0
+    half = torch.where(hits, root, torch.ones_like(root)).sqrt()
+    entry, leave = (-b - half) / flat, (-b + half) / flat
+    z = oz + entry * dz
+    on_side = hits & (entry > 0) & (z >= low) & (z <= high)
+    cap = torch.where(sz > 0, low - oz, high - oz) / sz
+    on_cap = hits & (cap > 0) & (cap >= entry) & (cap <= leave)
+    infinite = torch.full_like(entry, math.inf)
+    nearest, which = torch.minimum(torch.where(on_side, entry, infinite), torch.where(on_cap, cap, infinite)).min(-1)
+    on_can = nearest < best
+    return Hits(torch.where(on_can, nearest, best), down & ~on_can, which.masked_fill(~on_can, -1))

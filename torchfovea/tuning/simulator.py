@@ -27,8 +27,8 @@ from torchfovea.setting import require
 from torchfovea.tuning.scenes import Scenes, cast
 
 __all__ = [
-    "Memory", "Run", "Task", "World", "best_cell", "blank", "check_observer", "empty", "glance", "look", "score", "simulate",
-    "true_reward", "world_of", "worth",
+    "Memory", "Run", "Task", "World", "best_cell", "blank", "check_observer", "empty", "glance", "look", "score",
+    "simulate", "true_reward", "world_of", "worth",
 ]  # fmt: skip
 
 _FAR_M = 1000.0
@@ -134,9 +134,9 @@ def world_of(task: Task, scenes: Scenes, cells: Tensor, noise: Tensor) -> World:
 def glance(observer: Observer, pose: Eyes, point: Tensor, direction: Tensor, range_m: Tensor) -> tuple[Tensor, Tensor]:
     """Which points both retinas see, and the variance of their inverse range, to first order.
 
-    An error ε of one eye's ray inside the epipolar plane moves the point along the other eye's ray by ε s/sin δ, with s its
-    distance from the erring eye and δ the angle between the rays; the range from E changes by that times the cosine
-    between the unmoved ray and the cell's direction.
+    An error ε of one eye's ray inside the epipolar plane moves the point along the other eye's ray by ε s/sin δ, with
+    s its distance from the erring eye and δ the angle between the rays; the range from E changes by that times the
+    cosine between the unmoved ray and the cell's direction.
 
     Args:
         observer: camera, retina and error budget.
@@ -221,21 +221,28 @@ def best_cell(value: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def true_reward(task: Task, scenes: Scenes, gaze: Gaze) -> Tensor:
-    """−range of the first surface on the cyclopean ray (from E's origin, as the metrics have it), −far_m for floor."""
+    """−range of the first surface on the cyclopean ray (from E's origin, as the metrics have it), −far_m for floor.
+
+    Args:
+        task: with the head and far_m.
+        scenes: B of them.
+        gaze: angles (B, K).
+
+    Returns:
+        (B, K).
+    """
     rotation, origin = cyclopean(task.observer.head, gaze)
     axis = rotation[..., 2]
-    hits = cast(scenes, origin[:, None], axis[:, None])
-    point = origin + hits.range_m * axis
-    return -torch.where(hits.floor[:, 0], torch.full_like(point[:, 0], task.far_m), point.norm(dim=-1)).clamp(
-        max=task.far_m
-    )
+    hits = cast(scenes, origin, axis)
+    range_m = (origin + hits.range_m[..., None] * axis).norm(dim=-1)
+    return -torch.where(hits.floor, torch.full_like(range_m, task.far_m), range_m).clamp(max=task.far_m)
 
 
 def blank(task: Task, scenes: Scenes) -> tuple[Gaze, Tensor]:
     """The initial gaze, straight ahead (B,), and its reward."""
     zero = torch.zeros_like(scenes.nearest_m)
     gaze = Gaze(zero, zero, zero)
-    return gaze, true_reward(task, scenes, gaze)
+    return gaze, true_reward(task, scenes, Gaze(*(a[:, None] for a in gaze)))[:, 0]
 
 
 def worth(task: Task, reward: Tensor, nearest_m: Tensor) -> Tensor:
@@ -259,54 +266,49 @@ def simulate(
         scenes: B of them.
         world: their cells.
         alpha: exploration, (B,) or a scalar.
-        start: to begin at a decision: memory before it, (B, N); decisions already made t ≥ 0, (B,) int64; rewards so far
-            (B, T), of which the first t + 1 count. Runs later in their episode wait for the others.
+        start: to begin at a decision: memory before it, (B, N); decisions already made t ≥ 0, (B,) int64; rewards so
+            far (B, T), of which the first t + 1 count. Runs later in their episode wait for the others.
         keep: keep the memories before each decision.
 
     Same arguments, same episodes. Not differentiable: the policy is an argmax.
     """
     n, steps = len(scenes.nearest_m), task.saccades
-    gaze, first = blank(task, scenes)
-    reward = first[:, None].repeat(1, steps)
+    require(start is None or not keep, "keep", keep, "False for runs that begin later")
+    zero = torch.zeros_like(scenes.nearest_m)
     cells = torch.full((n, steps), -1)
-    scores = torch.full_like(reward, -math.inf)
-    gazes = [gaze]
+    scores = torch.full((n, steps), -math.inf, dtype=zero.dtype)
+    angles = torch.zeros(3, n, steps, dtype=zero.dtype)
     memories: list[Memory] = []
+    alpha = alpha.to(zero).expand(n)
     if start is None:
-        memory = look(task, world, empty(world), eyes(task.observer.head, gaze), 0)
-        made = torch.zeros(n, dtype=torch.long)
+        memory = look(task, world, empty(world), eyes(task.observer.head, Gaze(zero, zero, zero)), 0)
+        order, made = torch.arange(n), torch.zeros(n, dtype=torch.long)
     else:
-        memory, made, reward = start
-        reward = reward.clone()
-        require(not keep, "keep", keep, "False for runs that begin later")
-        order = made.argsort(stable=True)
-        memory, world, scenes = Memory(*(m[order] for m in memory)), world.take(order), scenes.take(order)
-        reward, alpha, made = reward[order], alpha.expand(n)[order], made[order]
+        memory, made, earlier = start
+        order = made.argsort(stable=True)  # those that begin first come first: the live ones are a slice
+        memory, world = Memory(*(m[order] for m in memory)), world.take(order)
+        alpha, made = alpha[order], made[order]
     for t in range(steps - 1):
-        live = n if start is None else int((made <= t).sum())
+        live = int((made <= t).sum())
         if live == 0:
-            gazes.append(gaze)
             continue
         part = slice(0, live)
         w = world if live == n else World(*(f[:, part] if i == 2 else f[part] for i, f in enumerate(world)))
         m = memory if live == n else Memory(*(f[part] for f in memory))
-        s = scenes if live == n else scenes.take(torch.arange(live))
         if keep:
             memories.append(m)
-        value, point = score(task, w, m, alpha.expand(n)[part])
+        value, point = score(task, w, m, alpha[part])
         best, cell = best_cell(value)
         chosen = point.gather(1, cell.clamp(min=0)[:, None, None].expand(-1, 1, 3))[:, 0]
-        ahead = (cell >= 0).to(best.dtype)
-        now = Gaze(*(angle * ahead for angle in fixate(task.observer.head, chosen)[0]))
-        reward[part, t + 1] = true_reward(task, s, now)
+        now = Gaze(*(angle * (cell >= 0) for angle in fixate(task.observer.head, chosen)[0]))
         cells[part, t + 1], scores[part, t + 1] = cell, best
-        gazes.append(now)
+        angles[:, part, t + 1] = torch.stack(now)
         if t + 2 < steps:
             m = look(task, w, m, eyes(task.observer.head, now), t + 1)
             memory = m if live == n else Memory(*(torch.cat((a, b[live:])) for a, b in zip(m, memory, strict=True)))
-    achieved = worth(task, reward, scenes.nearest_m)
+    back = order.argsort()
+    cells, scores, gaze, made = cells[back], scores[back], Gaze(*angles[:, back]), made[back]
+    reward = true_reward(task, scenes, gaze)
     if start is not None:
-        back = order.argsort()
-        achieved, reward, cells, scores = achieved[back], reward[back], cells[back], scores[back]
-        return Run(achieved, reward, cells, scores, gaze, [])
-    return Run(achieved, reward, cells, scores, Gaze(*(torch.stack(a, -1) for a in zip(*gazes, strict=True))), memories)
+        reward = torch.where(torch.arange(steps) > made[:, None], reward, earlier)
+    return Run(worth(task, reward, scenes.nearest_m), reward, cells, scores, gaze, memories)

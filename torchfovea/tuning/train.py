@@ -1,4 +1,4 @@
-"""Gradient ascent on a tuning problem: Adam with a schedule, checkpoints, resuming, and the best on validation scenes."""
+"""Gradient ascent on a tuning problem: Adam with a schedule, checkpoints, resuming, the best on validation scenes."""
 
 from __future__ import annotations
 
@@ -119,16 +119,16 @@ def train(
         problem: what is tuned.
         start: vector (K,).
         schedule: how.
-        checkpoint: a file that is written whole after each validation; if it exists, the run goes on from it as if it had
-            never stopped.
+        checkpoint: a file that is written whole after each validation; if it exists, the run goes on from it as if it
+            had never stopped.
         progress: called after each step with the state and the minibatch's objective.
 
     Returns:
         The last state. Its `best` is never below the start on the validation scenes.
 
     Raises:
-        SettingError: for a checkpoint of other settings, a start without reachable cells, and a step that is not finite;
-            the last checkpoint is then the last good one.
+        SettingError: for a checkpoint of other settings, a start without reachable cells, and a step that is not
+            finite; the last checkpoint is then the last good one.
     """
     state = _begin(problem, start, schedule, checkpoint)
     while state.episodes < schedule.episodes:
@@ -206,7 +206,9 @@ def _load(problem: Problem, schedule: Schedule, path: Path) -> State:
         content = torch.load(path, weights_only=True)
         made_with, state = content["made_with"], State(**content["state"])
     except (OSError, KeyError, TypeError, EOFError, RuntimeError, ValueError) as error:
-        raise SettingError(f"checkpoint = {os.fspath(path)}: expected a checkpoint of torchfovea tune ({error})") from error
+        raise SettingError(
+            f"checkpoint = {os.fspath(path)}: expected a checkpoint of torchfovea tune ({error})"
+        ) from error
     now = _signature(schedule, problem)
     for name, value in now.items():
         if name == "task":  # holds a function's address

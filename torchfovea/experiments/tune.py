@@ -1,0 +1,227 @@
+"""`torchfovea tune`: the memory's bias and α by gradient on simulated episodes, judged on held-out scenes."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+from torch import Tensor
+
+from torchfovea.config import run_folder
+from torchfovea.experiments.build import build_observer, construct, number, whole
+from torchfovea.files import replacing, write_csv, write_result
+from torchfovea.setting import require
+from torchfovea.significance import bootstrap_interval
+from torchfovea.sphere import direction_mixture, sphere_quadrature
+from torchfovea.tuning.baselines import SEARCHES, TABLE_1, hand, table_1
+from torchfovea.tuning.bias import Shape, decode, encode, mixture_of, reachable
+from torchfovea.tuning.prior_field import fit_by_gradient, fit_closed_form
+from torchfovea.tuning.problem import Problem, evaluate
+from torchfovea.tuning.scenes import Distribution, draw_scenes, stream
+from torchfovea.tuning.simulator import Task
+from torchfovea.tuning.study import curves, finite_difference_check
+from torchfovea.tuning.train import ESTIMATORS, Schedule, State, train
+
+__all__ = ["build_problem", "build_start", "memory_yaml", "run"]
+
+# what is null in the configuration
+PROFILES = {
+    "quick": {"episodes": 512, "validation_scenes": 128, "heldout_scenes": 256, "check_episodes": 0},
+    "full": {"episodes": 2048, "validation_scenes": 256, "heldout_scenes": 1024, "check_episodes": 1024},
+    "paper": {"episodes": 8192, "validation_scenes": 512, "heldout_scenes": 4096, "check_episodes": 8192},
+}
+_FIELD_SCENES = 512
+_FIELD_DIRECTIONS = 4000  # on the whole sphere
+_FIELD_ALPHAS = (0.1, 0.3, 1.0)
+
+
+def build_problem(cfg: DictConfig) -> Problem:
+    """What is tuned, from a configuration."""
+    node: Any = OmegaConf.to_container(cfg.distribution, resolve=True)
+    regions = node.pop("regions")
+    rows = isinstance(regions, list) and all(isinstance(row, list) and len(row) == 4 for row in regions)
+    require(rows, "distribution.regions", regions, "a list of [azimuth low, high, elevation low, high]")
+    settings: dict[str, Any] = {"regions": tuple(map(tuple, regions))}
+    whole_numbers = ("cans", "tries")
+    for name, value in node.items():
+        settings[name] = tuple(value) if isinstance(value, list) else value
+        if name in whole_numbers:
+            settings[name] = whole(cfg, f"distribution.{name}")
+    unknown = sorted(set(settings) - set(Distribution.__dataclass_fields__))
+    require(not unknown, "distribution", unknown, "settings of a scene distribution only")
+    try:
+        distribution = Distribution(**settings)
+    except TypeError as error:
+        require(False, "distribution", settings["name"], f"numbers where numbers belong ({error})")
+        raise
+    task = Task(build_observer(cfg), whole(cfg, "saccades", 2), number(cfg, "far_m"), str(cfg.metric))
+    alpha = OmegaConf.select(cfg, "acquisition.alpha")
+    require(cfg.acquisition.name == "ucb", "acquisition", cfg.acquisition.name, "ucb, whose alpha is tuned")
+    shape = Shape(whole(cfg, "components"), distribution.conditioned, bool(cfg.tune_alpha), float(alpha))
+    return Problem(task, distribution, shape, whole(cfg, "memory.cells", 2))
+
+
+def build_start(cfg: DictConfig, shape: Shape) -> Tensor:
+    """The vector of the bias `memory=...` with `acquisition.alpha`."""
+    memory = OmegaConf.to_container(cfg.memory, resolve=True)
+    assert isinstance(memory, dict)
+    complete = all(key in memory for key in ("weights", "means", "covariances"))
+    require(complete, "memory", memory.get("name"), "a bias with weights, means and covariances to start from")
+    mixture = direction_mixture(memory["weights"], memory["means"], memory["covariances"], dtype=torch.float64)
+    return encode(shape, mixture, float(cfg.acquisition.alpha))
+
+
+def memory_yaml(problem: Problem, vector: Tensor, task: Tensor | None, note: str) -> str:
+    """A bias in the form of conf/memory/*.yaml."""
+    mixture = mixture_of(problem.shape, vector.double(), task)
+    covariance = mixture.cholesky @ mixture.cholesky.mT
+    content = {
+        "name": "tuned",
+        "cells": 20000,
+        "weights": [round(v, 6) for v in mixture.logits.softmax(-1).tolist()],
+        "means": [[round(v, 6) for v in row] for row in mixture.means.tolist()],
+        "covariances": [[[round(v, 8) for v in row] for row in matrix] for matrix in covariance.tolist()],
+    }
+    return f"# {note}\n" + OmegaConf.to_yaml(OmegaConf.create(content))
+
+
+def run(cfg: DictConfig) -> float:
+    """Tune, judge and draw; the held-out gap per saccade of the tuned policy is what a sweeper sees."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # minibatches are small: more threads would only wait for each other
+    try:
+        return _run(cfg)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _run(cfg: DictConfig) -> float:
+    profile = PROFILES[str(HydraConfig.get().runtime.choices["profile"])]
+    sizes = {name: value if cfg[name] is None else whole(cfg, name, 0) for name, value in profile.items()}
+    problem = build_problem(cfg)
+    start, folder = build_start(cfg, problem.shape), run_folder()
+    settings = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(settings, dict)
+    merged = {str(name): value for name, value in settings.items()} | sizes
+    schedule = construct(Schedule, merged, "tune")
+    checkpoint = folder / "checkpoint.pt"
+    if cfg.resume is not None:
+        require(Path(cfg.resume).is_file(), "resume", cfg.resume, "a checkpoint.pt that exists")
+        shutil.copyfile(cfg.resume, checkpoint)
+    bars = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*bars, console=Console(stderr=True), transient=True) as progress:
+        bar = progress.add_task("tune", total=schedule.episodes)
+
+        def show(state: State, value: float) -> None:
+            recent = [v for _, v in state.curve[-16:]]
+            mean = sum(recent) / len(recent)
+            text = f"tune  objective {mean:.3f}  best on validation {state.best_value:.3f}"
+            progress.update(bar, completed=min(int(state.episodes), schedule.episodes), description=text)
+
+        state = train(problem, start, schedule, checkpoint, show)
+    figures: dict[str, Any] = {
+        "episodes_used": state.episodes,
+        "runs_begun": state.runs,
+        "parameters": problem.shape.size,
+    }
+    _write_memory(problem, state, folder)
+    table, best = _judge(cfg, problem, start, state, sizes["heldout_scenes"], figures)
+    check = None
+    if sizes["check_episodes"] > 0:
+        check = finite_difference_check(problem, start, schedule.estimator, sizes["check_episodes"])
+    figures["gradient_cosine"] = check["cosine"] if check else None
+    figures["gradient_norm_ratio"] = check["norm_ratio"] if check else None
+    rows = _study(cfg, problem, start, schedule, sizes["heldout_scenes"], folder) if cfg.study else []
+    from torchfovea.pictures_tuning import draw_tuning
+
+    draw_tuning(folder, problem, start, state, check, rows)
+    write_csv(folder / "tuning.csv", ("episodes", "validation"), [(e, v) for e, v, _ in state.history])
+    write_result(folder, figures)
+    Console().print(table)
+    return best
+
+
+def _write_memory(problem: Problem, state: State, folder: Path) -> None:
+    """The result as files for `search --config-dir FOLDER memory=tuned`; a conditioned one for nine tasks."""
+    alpha = float(decode(problem.shape, state.best, torch.zeros(1, 2, dtype=torch.float64)).alpha)
+    use = f"torchfovea search --config-dir THIS_RUNS_FOLDER memory=NAME acquisition.alpha={alpha:.4g}"
+    tasks: dict[str, Tensor | None] = {"tuned": None}
+    if problem.shape.conditioned:
+        corners = [(a, e) for a in (-1.0, 0.0, 1.0) for e in (-1.0, 0.0, 1.0)]
+        tasks = {f"tuned_task_{a:+.0f}_{e:+.0f}": torch.tensor([a, e]) for a, e in corners}
+    for name, task in tasks.items():
+        note = f"Tuned on {problem.distribution.name}; {use.replace('NAME', name)}"
+        text = memory_yaml(problem, state.best, task, note)
+        with replacing(folder / "memory" / f"{name}.yaml") as temporary:
+            temporary.write_text(text, encoding="utf-8")
+
+
+def _judge(
+    cfg: DictConfig, problem: Problem, start: Tensor, state: State, scenes: int, figures: dict[str, Any]
+) -> tuple[Table, float]:
+    """Every policy on the held-out scenes."""
+    alpha, checked = float(cfg.acquisition.alpha), min(scenes, 512)
+    policies = {name: (table_1(problem.shape, name, alpha), problem) for name in TABLE_1}
+    policies["start"] = (start, problem)
+    policies["hand"] = (hand(problem, alpha, checked)[0], problem)
+    policies["tuned"] = (state.best, problem)
+    if cfg.prior_field:
+        head, dtype = problem.task.observer.head, problem.dtype
+        own = stream("training", int(cfg.seed), 10**8)
+        scenes_seen = draw_scenes(problem.distribution, head, _FIELD_SCENES, own, dtype)
+        grid = sphere_quadrature(_FIELD_DIRECTIONS, lambda d: reachable(head, d), dtype).directions
+        for name, fit in (("prior_field", fit_closed_form), ("prior_field_gradient", fit_by_gradient)):
+            field = fit(scenes_seen, grid, problem.task.far_m)
+            informed = Problem(problem.task, problem.distribution, problem.shape, problem.cells, problem.dtype, field)
+            tried = [table_1(problem.shape, "unbiased", a) for a in _FIELD_ALPHAS]
+            scores = [float(evaluate(informed, v, min(checked, 256), stream("validation", 0)).mean()) for v in tried]
+            policies[name] = (tried[scores.index(max(scores))], informed)
+            if name == "prior_field":
+                policies["tuned_with_prior_field"] = (state.best, informed)
+    table = Table("policy", "gap per saccade", "95% CI", box=None, padding=(0, 2, 0, 0))
+    best = 0.0
+    for name, (vector, judged) in policies.items():
+        values = evaluate(judged, vector, scenes, stream("heldout", 0))
+        interval = bootstrap_interval(values, torch.Generator().manual_seed(0), resamples=2000)
+        for key, value in zip(("gap_per_saccade", "ci_low", "ci_high"), interval, strict=True):
+            figures[f"heldout.{name}.{key}"] = float(value)
+        table.add_row(name, f"{interval.estimate:.4f}", f"{interval.low:.4f} to {interval.high:.4f}")
+        best = float(interval.estimate) if name == "tuned" else best
+    return table, best
+
+
+def _study(
+    cfg: DictConfig, problem: Problem, start: Tensor, schedule: Schedule, scenes: int, folder: Path
+) -> list[Any]:
+    """Learning curves of the methods asked for."""
+    methods = [str(method) for method in cfg.methods]
+    for method in methods:
+        known = method in SEARCHES or method.partition("+")[0] in ESTIMATORS
+        require(known, "methods", method, "any of " + ", ".join([*ESTIMATORS, *SEARCHES]))
+    seeds = whole(cfg, "seeds")
+    rows = []
+    with Progress(
+        TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=Console(stderr=True), transient=True
+    ) as bar:
+        job = bar.add_task("study", total=len(methods) * seeds)
+
+        def show(method: str, seed: int) -> None:
+            bar.update(job, advance=1, description=f"study  {method}, seed {seed + 1} of {seeds}")
+
+        for row in curves(problem, start, methods, seeds, schedule, scenes, show):
+            rows.append(row)
+            write_csv(folder / "curves.csv", ("method", "seed", "episodes", "validation", "heldout"), rows)
+    return rows

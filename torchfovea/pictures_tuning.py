@@ -1,0 +1,140 @@
+"""Pictures of a tuning run: the bias on the sphere, learning curves, and the gradient against finite differences."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchfovea.files import write_figure
+from torchfovea.tuning.bias import log_density_each, log_normalizer_each, reachable
+from torchfovea.tuning.problem import Problem
+from torchfovea.tuning.scenes import Scenes, draw_scenes, stream
+from torchfovea.tuning.train import State
+
+matplotlib.use("Agg")
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+__all__ = ["draw_curves", "draw_gradient", "draw_tuning"]
+
+# two-sided 95% quantiles of Student's t by degrees of freedom, for bands over few seeds
+_STUDENT = {1: 12.71, 2: 4.30, 3: 3.18, 4: 2.78, 5: 2.57, 6: 2.45, 7: 2.36, 8: 2.31, 9: 2.26}
+
+
+def draw_tuning(
+    folder: Path, problem: Problem, start: Tensor, state: State, check: dict[str, Any] | None, rows: Sequence[Any]
+) -> None:
+    """Draw bias.png and learning.png, and where there is something to draw, gradient.png and curves.png."""
+    _draw_bias(folder / "bias.png", problem, start, state)
+    _draw_learning(folder / "learning.png", state)
+    if check is not None:
+        draw_gradient(folder / "gradient.png", check)
+    if rows:
+        draw_curves(folder / "curves.png", rows)
+
+
+def _grid(problem: Problem) -> tuple[np.ndarray, np.ndarray, Tensor, Tensor]:
+    azimuth, elevation = np.linspace(-65, 65, 131), np.linspace(-45, 35, 81)
+    a, e = (torch.deg2rad(torch.tensor(g, dtype=problem.dtype)) for g in np.meshgrid(azimuth, elevation))
+    direction = torch.stack((a.cos() * e.cos(), a.sin() * e.cos(), e.sin()), -1).reshape(-1, 3)
+    return azimuth, elevation, direction, reachable(problem.task.observer.head, direction).reshape(a.shape)
+
+
+def _draw_bias(path: Path, problem: Problem, start: Tensor, state: State) -> None:
+    azimuth, elevation, direction, within = _grid(problem)
+    middle = torch.tensor(state.history[len(state.history) // 2][2], dtype=torch.float64)
+    scenes = draw_scenes(problem.distribution, problem.task.observer.head, 256, stream("validation", 0), problem.dtype)
+    if problem.shape.conditioned:
+        # one task: the scenes that have about it
+        scenes = scenes._replace(task=torch.full_like(scenes.task, 0.5))
+    figure = Figure(figsize=(13, 3.6), layout="constrained")
+    axes = figure.subplots(1, 3, sharey=True)
+    shown = []
+    for ax, vector, title in zip(axes, (start, middle, state.best), ("before", "during", "after"), strict=True):
+        with torch.no_grad():
+            bias = problem.bias(vector, scenes.take(torch.arange(1)))
+            density = log_density_each(bias, direction[None])[0] - log_normalizer_each(bias, problem.quadrature)
+        shown.append(torch.where(within, density.exp().reshape(within.shape), torch.nan).numpy())
+        ax.set(title=f"{title}, α = {float(bias.alpha):.2f}", xlabel="azimuth [°] (left is positive)")
+    most = max(float(np.nanmax(values)) for values in shown)
+    for ax, values in zip(axes, shown, strict=True):
+        drawn = ax.pcolormesh(azimuth, elevation, values, cmap="viridis", vmin=0, vmax=most, rasterized=True)
+        _targets(ax, scenes)
+        ax.invert_xaxis()
+    figure.colorbar(drawn, ax=axes, label="share of cells per steradian", pad=0.01)
+    axes[0].set_ylabel("elevation [°]")
+    figure.suptitle(f"{problem.distribution.name}: density of memory cells, and where the nearest can stands (dots)")
+    write_figure(path, figure, dpi=130)
+
+
+def _targets(ax: Axes, scenes: Scenes) -> None:
+    middle = (scenes.low + scenes.high)[:, 0] / 2
+    flat = torch.hypot(scenes.x[:, 0], scenes.y[:, 0])
+    azimuth = torch.rad2deg(torch.atan2(scenes.y[:, 0], scenes.x[:, 0]))
+    ax.plot(azimuth, torch.rad2deg(torch.atan2(middle, flat)), ".", color="white", ms=3, mec="0.2", mew=0.3)
+
+
+def _draw_learning(path: Path, state: State) -> None:
+    figure = Figure(figsize=(6.4, 4), layout="constrained")
+    ax = figure.subplots()
+    if state.curve:
+        episodes, values = (np.array(c) for c in zip(*state.curve, strict=True))
+        ax.plot(episodes, values, ".", color="0.75", ms=3, label="minibatch")
+    ax.plot(
+        [e for e, _, _ in state.history],
+        [v for _, v, _ in state.history],
+        "o-",
+        color="tab:blue",
+        ms=4,
+        label="validation",
+    )
+    ax.axhline(state.best_value, color="tab:blue", lw=0.7, ls=":")
+    ax.set(xlabel="simulated episodes", ylabel="objective")
+    ax.legend(frameon=False)
+    write_figure(path, figure, dpi=130)
+
+
+def draw_gradient(path: Path, check: dict[str, Any]) -> None:
+    """Each number's derivative: the estimate beside central differences."""
+    estimate, difference = np.array(check["estimate"]), np.array(check["difference"])
+    figure = Figure(figsize=(max(6.4, 0.25 * len(estimate)), 3.6), layout="constrained")
+    ax = figure.subplots()
+    place = np.arange(len(estimate))
+    ax.bar(place - 0.2, difference, 0.4, color="0.6", label="central differences")
+    ax.bar(place + 0.2, estimate, 0.4, color="tab:blue", label="estimator")
+    ax.axhline(0, color="0.2", lw=0.6)
+    ax.set(xlabel="number", ylabel="derivative of the objective")
+    ax.set_title(f"cosine {check['cosine']:.3f}, norm ratio {check['norm_ratio']:.3f}")
+    ax.legend(frameon=False)
+    write_figure(path, figure, dpi=130)
+
+
+def draw_curves(path: Path, rows: Sequence[Any]) -> None:
+    """Held-out score over episodes for each method: mean over seeds with its 95% interval (Student's t)."""
+    scores: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
+    for method, _, episodes, _, heldout in rows:
+        scores[method][int(episodes)].append(float(heldout))
+    figure = Figure(figsize=(7.6, 5), layout="constrained")
+    ax = figure.subplots()
+    for k, (method, by_budget) in enumerate(scores.items()):
+        budgets = sorted(by_budget)
+        mean = np.array([np.mean(by_budget[b]) for b in budgets])
+        half = []
+        for b in budgets:
+            n = len(by_budget[b])
+            t = _STUDENT.get(n - 1, 1.96)
+            half.append(t * np.std(by_budget[b], ddof=1) / math.sqrt(n) if n > 1 else 0.0)
+        colour = f"C{k % 10}"
+        ax.plot(budgets, mean, "o-", ms=3.5, color=colour, label=method.replace("_", " "))
+        ax.fill_between(budgets, mean - half, mean + half, color=colour, alpha=0.15, lw=0)
+    ax.set(xscale="log", xlabel="simulated episodes, counterfactual runs included", ylabel="held-out gap per saccade")
+    ax.legend(frameon=False, ncols=2)
+    write_figure(path, figure, dpi=130)
