@@ -42,7 +42,7 @@ ADVANTAGE_COLUMNS = (
 )  # fmt: skip
 # Sizes that a profile chooses where a setting is null
 QUICK = {"distances": 5, "vergences": 13, "propagation.samples": 50_000, "realised.source_px": [200]}
-FULL = {"distances": 20, "vergences": 46, "propagation.samples": 1 << 20, "realised.source_px": [200, 400, 800]}
+FULL = {"distances": 20, "vergences": 31, "propagation.samples": 1 << 20, "realised.source_px": [200, 400, 800]}
 
 
 def run(cfg: DictConfig) -> float:
