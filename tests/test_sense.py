@@ -119,7 +119,7 @@ def test_disparity_files(tmp_path):
         np.testing.assert_array_equal(read_disparity(tmp_path / name, "disparity"), truth)
     np.testing.assert_array_equal(read_disparity(tmp_path / "a.png", "disparity"), np.where(truth == 0, np.nan, truth))
     (tmp_path / "b.npy").write_text("x")
-    with pytest.raises(SettingError, match="disparity = .*b.npy"):
+    with pytest.raises(SettingError, match=r"disparity = .*b\.npy"):
         read_disparity(tmp_path / "b.npy", "disparity")
     assert read_image(tmp_path / "a.npy", "left").shape == (3, 3, 4)
 
