@@ -263,6 +263,10 @@ def test_observations_of_a_batch_are_those_of_a_loop():
         assert bool((cosine[2] == -1).all())
 
 
+def test_many_cells_without_a_gate():
+    check_observations(cluster(4000, 0, 0.2), random_directions(4000, 1), math.pi)
+
+
 def test_no_observation_and_no_cell():
     cells = random_directions(4, 0)
     number, cosine = nearest_observation(torch.zeros(0, 3, dtype=F64), cells, 0.1)

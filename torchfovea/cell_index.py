@@ -25,7 +25,7 @@ SLOTS = 4  # cells a row
 _ROOTS = 4  # texels along an edge of the cube at the start of a build
 _FINEST = 1 << 21  # texels along an edge beyond which none is cut: the resolution of float32 directions
 _SHORT_LIST = 16  # cells that meet at one point are listed rather than separated, two cuts below the table
-_PAIRS_CPU, _PAIRS_GPU = 1 << 15, 1 << 20  # (texel, cell) pairs treated at once
+_PAIRS_CPU, _PAIRS_GPU = 1 << 14, 1 << 20
 
 
 class CellIndex(NamedTuple):
@@ -140,36 +140,34 @@ def arange(n: int, like: Tensor) -> Tensor:
     return torch.arange(n, device=like.device)
 
 
+def _limit(like: Tensor) -> int:
+    """Pairs treated at once: on the CPU so few that they fit its cache and no operation waits for other threads."""
+    return _PAIRS_CPU if like.device.type == "cpu" else _PAIRS_GPU
+
+
 def _roots(p: Tensor, count: int, size: int) -> _Frontier:
-    """The cells that may be nearest in each of size² texels of a face: all pairs are tried, a few sets at a time."""
-    width = 1 / size
-    sets = len(p) // count
-    step = max(1, (1 << 21) // (size * size * count))
-    centre = (2 * arange(size, p) + 1) * width - 1
+    """The cells that may be nearest in each of size² texels of a face: all pairs are tried."""
+    width, sets = 1 / size, len(p) // count
+    step = max(1, _limit(p) // count)
     parts = []
     for begin in range(0, sets, step):
-        x, y, z = p.view(sets, count, 3)[begin : begin + step].unbind(-1)
+        x, y, z = (t.contiguous() for t in p.view(sets, count, 3)[begin : begin + step].unbind(-1))
         kept: list[tuple[Tensor, ...]] = []
         for face, (major, du, dv) in enumerate(((x, y, z), (-x, y, z), (y, z, x), (-y, z, x), (z, x, y), (-z, x, y))):
-            score = (
-                major[:, None, None] + centre[:, None, None] * du[:, None, None] + centre[:, None] * dv[:, None, None]
-            )
-            winner = score.argmax(-1)
-            flat = winner + count * arange(len(du), p)[:, None, None]
-            slope = (du.reshape(-1)[flat][..., None] - du[:, None, None]).abs_()
-            slope += (dv.reshape(-1)[flat][..., None] - dv[:, None, None]).abs_()
-            keep = score.gather(-1, winner[..., None]) - score < width * slope
-            pair = keep.scatter_(-1, winner[..., None], True).view(-1).nonzero().squeeze(1)
-            texel = pair // count  # (set, i, j) of this face
-            cell = pair - texel * count + texel // size**2 * count
-            score, du, dv = (t.reshape(-1).index_select(0, k) for t, k in ((score, pair), (du, cell), (dv, cell)))
-            texel = texel + (5 * (texel // size**2) + face) * size**2  # (set, face, i, j)
-            kept.append((texel, cell + begin * count, score, du, dv))
-        texel, cell, score, du, dv = (torch.cat(t) for t in zip(*kept, strict=True))
+            for place in range(size * size):
+                u, v = ((2 * k + 1) * width - 1 for k in divmod(place, size))
+                score = (major + u * du).add_(dv, alpha=v)
+                winner = score.argmax(-1, keepdim=True)
+                slope = (du.gather(-1, winner) - du).abs_().add_((dv.gather(-1, winner) - dv).abs_())
+                keep = score.gather(-1, winner) - score < slope.mul_(width)
+                cell = keep.scatter_(-1, winner, True).view(-1).nonzero().squeeze(1)
+                texel = (6 * (cell // count) + face) * size**2 + place
+                kept.append((texel, cell + begin * count, *(t.view(-1).index_select(0, cell) for t in (score, du, dv))))
+        texel, *pairs = (torch.cat(t) for t in zip(*kept, strict=True))
         texel, order = texel.sort(stable=True)
-        number = arange(6 * min(step, sets - begin) * size * size, p)
-        place = (number // size**2 + 6 * begin, number // size % size, number % size, number)
-        parts.append(_Frontier._make((*place, texel, *(t.index_select(0, order) for t in (cell, score, du, dv)))))
+        number = arange(6 * len(x) * size * size, p)
+        texels = (number // size**2 + 6 * begin, number // size % size, number % size, number)
+        parts.append(_Frontier._make((*texels, texel, *(t.index_select(0, order) for t in pairs))))
     return _join(parts)
 
 
@@ -213,7 +211,7 @@ def _needed(texel: Tensor, texels: int, score: Tensor, du: Tensor, dv: Tensor, w
 
 def _pieces(front: _Frontier) -> list[_Frontier]:
     """Cut a frontier between texels: on the CPU into pieces that fit its cache."""
-    limit = _PAIRS_CPU if front.cell.device.type == "cpu" else _PAIRS_GPU
+    limit = _limit(front.cell)
     if len(front.cell) <= limit:
         return [front]
     bounds = [*front.texel[::limit].unique().tolist(), len(front.face)]

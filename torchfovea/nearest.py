@@ -17,7 +17,7 @@ from torchfovea.setting import require
 
 __all__ = ["CellIndex", "build_index", "nearest_cell", "nearest_observation", "neighbour_spacing_rad"]
 
-_NARROWEST_BUCKET, _WIDEST_BUCKET = 0.004, 0.1  # rad; beyond the latter, all observations are tried
+_NARROWEST_BUCKET, _WIDEST_BUCKET = 0.004, 0.1  # rad; beyond the latter there are none
 
 
 def nearest_cell(index: CellIndex, directions: Tensor) -> tuple[Tensor, Tensor]:
@@ -113,7 +113,7 @@ def nearest_observation(
     What `nearest_cell` is with the roles swapped, for observations that change with every saccade: they are sorted into
     the buckets of a cube map as wide as the gate, and a cell looks into nine. Cells with wider gates than the narrowest
     look again in wider buckets where they found nothing. The narrower the gate and the fewer cells are `wanted`, the
-    faster: without a gate, cells far from all observations are compared with every one.
+    faster: cells with wide gates and no observation near cost as much as indexing the observations.
 
     Args:
         directions: of the observations, any positive length, (..., N, 3). Those that are zero or not finite do not
@@ -168,18 +168,20 @@ def _chord(angle: Tensor) -> Tensor:
 
 
 def _in_all(o: Tensor, o_set: Tensor, c: Tensor, c_set: Tensor, gate: Tensor) -> Tensor:
-    """Nearest observation of each cell by trying all of its set; -1 where none is within the gate."""
+    """Nearest observation of each cell among all of its set; -1 where none is within the gate."""
     found = torch.full((len(c),), -1, device=c.device)
     fine_c, fine_o = (torch.nn.functional.normalize(t.double(), dim=-1) for t in (c, o))
     for number in c_set.unique().tolist():
         mine, theirs = (c_set == number).nonzero().squeeze(1), (o_set == number).nonzero().squeeze(1)
         if len(theirs) == 0:
             continue
-        for part in mine.split(max(1, (1 << 22) // len(theirs))):
-            best = (fine_c.index_select(0, part) @ fine_o.index_select(0, theirs).T).argmax(-1)
-            nearest = theirs.index_select(0, best)
-            chord = (c.index_select(0, part) - o.index_select(0, nearest)).norm(dim=-1)
-            found[part] = torch.where(chord <= _chord(gate.index_select(0, part)), nearest, -1)
+        if len(mine) * len(theirs) > 1 << 23:
+            best, _ = nearest_cell(build_index(fine_o.index_select(0, theirs)), fine_c.index_select(0, mine))
+        else:
+            best = (fine_c.index_select(0, mine) @ fine_o.index_select(0, theirs).T).argmax(-1)
+        nearest = theirs.index_select(0, best)
+        chord = (c.index_select(0, mine) - o.index_select(0, nearest)).norm(dim=-1)
+        found[mine] = torch.where(chord <= _chord(gate.index_select(0, mine)), nearest, -1)
     return found
 
 
