@@ -93,7 +93,7 @@ def associate(
     return Pairs(torch.cat([pair, source]), torch.cat([cell, extra]))
 
 
-def in_front(near: Tensor, std: Tensor, cell: Tensor, cells: int, limit: float) -> Tensor:
+def in_front(near: Tensor, std: Tensor, cell: Tensor, cells: int, limit: float, hides: Tensor | None = None) -> Tensor:
     """A z-buffer that knows its noise: drop what lies behind another observation of the same cell.
 
     The eyes are beside and above the ego frame's origin and see past the edge of a near thing; from that origin what
@@ -105,11 +105,13 @@ def in_front(near: Tensor, std: Tensor, cell: Tensor, cells: int, limit: float) 
         cell: (M,) int64.
         cells: how many there are.
         limit: how many standard deviations apart, counted on either side, two surfaces are two.
+        hides: which of them can hide others, bool (M,); None: all.
 
     Returns:
         Whether each is kept, bool (M,).
     """
     margin = limit * std
     surface = torch.full((cells,), -torch.inf, dtype=near.dtype, device=near.device)
-    surface = surface.scatter_reduce(0, cell, near - margin, "amax")
+    edge = near - margin if hides is None else torch.where(hides, near - margin, -torch.inf)
+    surface = surface.scatter_reduce(0, cell, edge, "amax")
     return near + margin >= surface.index_select(0, cell)

@@ -138,8 +138,9 @@ def move(
     """Carry one memory along with the base.
 
     Each seen cell's point or patch is moved with its covariance (the rotation exactly, the odometry's covariance added)
-    and finds its new cell. Of several in one cell those that a nearer one hides are left out, and of the rest the best
-    known stays *alone*: neighbours share the odometry's error, so that their sum would claim too much. A cell that got
+    and finds its new cell. Of several in one cell those that a nearer one hides are left out, and of the rest the one
+    closest to the cell's direction stays *alone*: neighbours share the odometry's error, so that their sum would claim
+    too much. A cell that got
     nothing takes the nearest patch within 1.5 spacings. Cells that nothing moved into are unseen.
 
     Args:
@@ -166,14 +167,17 @@ def move(
     cell, cosine = nearest_cell(index, direction)
     near = torch.acos(cosine.clamp(-1, 1)) <= 1.5 * spacing_rad[cell].clamp(max=math.pi / 2)
     taken = near.nonzero().squeeze(1)
-    rho, variance = _seen_from(moved, taken, cells[cell[taken]], chart)
-    visible = in_front(rho, variance.sqrt(), cell[taken], len(cells), fusion.conflict)
-    best = torch.zeros(len(cells), dtype=rho.dtype, device=cells.device)
-    precision = torch.where(visible, 1 / variance, torch.zeros_like(variance))
-    best = best.scatter_reduce(0, cell[taken], precision, "amax")
+    home = cell[taken]
+    rho, variance = _seen_from(moved, taken, cells[home], chart)
+    # the outermost patch of a thing ends half a spacing beyond itself: farther it hides nothing, or things would grow
+    apart = (direction[taken] - cells[home]).norm(dim=-1)
+    hides = apart <= 0.5 * spacing_rad[home]
+    visible = in_front(rho, variance.sqrt(), home, len(cells), fusion.conflict, hides)
+    closest = torch.full((len(cells),), math.inf, dtype=cells.dtype, device=cells.device)
+    closest = closest.scatter_reduce(0, home[visible], apart[visible], "amin")
     source = torch.full((len(cells),), -1, dtype=torch.int64, device=cells.device)
-    winner = visible & (precision == best[cell[taken]])
-    source = source.scatter_reduce(0, cell[taken][winner], taken[winner], "amax")
+    winner = visible & (apart == closest[home])
+    source = source.scatter_reduce(0, home[winner], taken[winner], "amax")
     shown = torch.ones_like(near)
     shown[taken[~visible]] = False
     free = source < 0

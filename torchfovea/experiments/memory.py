@@ -32,11 +32,14 @@ def run(cfg: DictConfig) -> float:
     from torchfovea.pictures_memory import draw_memory
 
     observer, folder, seed = build_observer(cfg), run_folder(), whole(cfg, "seed", 0)
+    arena = build_arena(cfg, observer, seed)
+    toward = torch.nn.functional.normalize(arena.world.scene.nearest_point_e.double(), dim=-1)
+    if OmegaConf.select(cfg, "memory.means", default="none") is None:  # a bias that is aimed at the scene's own target
+        cfg = OmegaConf.merge(cfg, {"memory": {"means": [toward.tolist()]}})  # type: ignore[assignment]
     cells = build_cells(cfg, observer.head, torch.Generator().manual_seed(seed), torch.float64)
-    truth = build_arena(cfg, observer, seed).truth(cells)
+    truth = arena.truth(cells)
     near = near_target(truth.cell_points, truth.nearest_point, number(cfg, "near_target_m"))
     spacing = torch.rad2deg(neighbour_spacing_rad(cells))
-    toward = torch.nn.functional.normalize(truth.nearest_point.double(), dim=-1)
     within = (cells @ toward).acos().rad2deg() if len(cells) else spacing
     figures = {
         "cells": len(cells),
