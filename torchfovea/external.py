@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.camera import Camera, Pinhole
+from torchfovea.confidence import read_clues
 from torchfovea.correspondence import Budget, Correspondences, Disparity
 from torchfovea.disparity_files import check_maps, load_disparity
 from torchfovea.gaussian import columns
@@ -184,7 +185,7 @@ def match_external_rectified(
     left_px = match.correspondences.left_px
     origin = left_px.new_tensor([match.camera_left.cx_px, match.camera_left.cy_px])
     place = (left_px - origin) * scale + left_px.new_tensor([camera_left.cx_px, camera_left.cy_px])
-    found = _doubt(match.correspondences, confidence, place, scale, params)
+    found = _doubt(match.correspondences, confidence, place, scale, params, (budget or Budget()).claim)
     grey = pair[0].mean(0).to(disparity)
     return match._replace(correspondences=found, disparity=match.disparity._replace(image=grey))
 
@@ -259,12 +260,14 @@ def match_external(
     there = view.rays(columns(place[..., 0] - shift, place[..., 1])) @ R_right
     right_px = camera.project(there)
     found &= camera.in_view(there) & retina.inside(right_px)
-    matches = correspondences(left_px, right_px, found, retina, budget)
-    return _doubt(matches, confidence, place, size / (2 * retina.radius_px), params), field
+    scale = size / (2 * retina.radius_px)
+    clues = read_clues(field, place, shift, retina.width_px(left_px) * scale)
+    matches = correspondences(left_px, right_px, found, retina, budget, clues)
+    return _doubt(matches, confidence, place, scale, params, budget.claim), field
 
 
 def _doubt(
-    matches: Correspondences, confidence: Tensor | None, place: Tensor, scale: float, params: External
+    matches: Correspondences, confidence: Tensor | None, place: Tensor, scale: float, params: External, claim: float
 ) -> Correspondences:
     """Add the confidences' share to the right eye's standard deviations; `place` (N, 2) in the map's pixels."""
     if confidence is None:
@@ -274,4 +277,4 @@ def _doubt(
         near = place.round().long()
         column, row = near[..., 0].clamp(0, width - 1), near[..., 1].clamp(0, height - 1)
         sigma = params.sigma_px(confidence.to(place)[row, column])
-    return matches._replace(right_sigma_px=torch.hypot(matches.right_sigma_px, sigma / scale))
+    return matches._replace(right_sigma_px=torch.hypot(matches.right_sigma_px, claim * sigma / scale))

@@ -152,7 +152,7 @@ def match_sweep(
         left_px.expand(batch, -1, -1),
         right_px,
         eye_sigma_px(budget, retina, left_px).expand(batch, -1),
-        (eye_sigma_px(budget, retina, right_px).square() + match_px).sqrt(),
+        (eye_sigma_px(budget, retina, right_px).square() + budget.claim**2 * match_px).sqrt(),
         valid,
     )
     found = [torch.where(valid, x, zero) for x in (rho / length, sigma / length, correlation)]
