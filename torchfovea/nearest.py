@@ -17,7 +17,7 @@ from torchfovea.setting import require
 
 __all__ = ["CellIndex", "build_index", "nearest_cell", "nearest_observation", "neighbour_spacing_rad"]
 
-_NARROWEST_BUCKET, _WIDEST_BUCKET = 0.004, 0.1  # rad; beyond the latter there are none
+_FIRST_BUCKET, _WIDEST_BUCKET = (0.004, 0.02), 0.1  # rad; range of the first, and beyond which there are none
 
 
 def nearest_cell(index: CellIndex, directions: Tensor) -> tuple[Tensor, Tensor]:
@@ -148,7 +148,7 @@ def nearest_observation(
         return number.view(cells.shape[:-1]), cosine.view(cells.shape[:-1])
     c = cells.detach().reshape(-1, 3)
     o_set = seen // count
-    reach = min(max(float(gate.index_select(0, looking).min()), _NARROWEST_BUCKET), _WIDEST_BUCKET)
+    reach = min(max(float(gate.index_select(0, looking).min()), _FIRST_BUCKET[0]), _FIRST_BUCKET[1])
     while len(looking):
         limit = gate.index_select(0, looking)
         asking = (o, o_set, c.index_select(0, looking), looking // cells.shape[-2], limit)
