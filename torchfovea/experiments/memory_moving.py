@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchfovea.egosphere import new_egosphere
 from torchfovea.experiments.build import build_arena, build_cells, build_observer, number, whole
-from torchfovea.experiments.memory_study import COLUMNS, Rows, _estimate, _figures, fixation_course, judge_cells
+from torchfovea.experiments.memory_study import COLUMNS, Rows, estimate, figures_of, fixation_course, judge_cells
 from torchfovea.head import Gaze, eyes, fixate
 from torchfovea.metrics import gap
 from torchfovea.moving import Motion, motion, move, resample
@@ -80,8 +80,8 @@ def study_moving(cfg: DictConfig, rows: Rows) -> None:
                     for gaze in list(fixation_course(arena, cells, looks + 1, 1000 * t + k))[1:]:
                         mind = _look(observer, mind, arena, gaze, generator)
                 if t in marks:
-                    found[t].append((*_estimate(observer, mind), judge_cells(arena.world, cells)))
-        rows.rows += [(looks, t, *_figures(parts)) for t, parts in found.items()]
+                    found[t].append((*estimate(observer, mind), judge_cells(arena.world, cells)))
+        rows.rows += [(looks, t, *figures_of(parts)) for t, parts in found.items()]
 
 
 def study_resampling(cfg: DictConfig, rows: Rows) -> None:

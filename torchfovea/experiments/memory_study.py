@@ -23,7 +23,16 @@ from torchfovea.sim.arena import Arena
 from torchfovea.sim.world import World
 from torchfovea.unscented import SigmaPoints
 
-__all__ = ["Judge", "Rows", "fixation_course", "judge_cells", "study_encoders", "study_fusion"]
+__all__ = [
+    "Judge",
+    "Rows",
+    "estimate",
+    "figures_of",
+    "fixation_course",
+    "judge_cells",
+    "study_encoders",
+    "study_fusion",
+]
 
 COLUMNS = (
     "cells", "straddling", "range_ratio_median", "relative_error_median", "nees_mean", "z2_median", "outlier_share",
@@ -88,7 +97,7 @@ def judge_cells(world: World, cells: Tensor) -> Judge:
     return Judge(value[:, 0], (value @ rest).abs().amax(-1) > 0.02 * value[:, 0])
 
 
-def _figures(estimates: Sequence[tuple[Tensor, Tensor, Tensor, Judge]]) -> tuple[Any, ...]:
+def figures_of(estimates: Sequence[tuple[Tensor, Tensor, Tensor, Judge]]) -> tuple[Any, ...]:
     """COLUMNS from inverse ranges, their variances, what was seen, and the truth, of several memories."""
     parts = [(m[s].double(), v[s].double(), j.rho[s], j.straddles[s]) for m, v, s, j in estimates]
     rho, variance, true, straddles = (torch.cat(part) for part in zip(*parts, strict=True))
@@ -108,7 +117,7 @@ def _figures(estimates: Sequence[tuple[Tensor, Tensor, Tensor, Judge]]) -> tuple
     )  # fmt: skip
 
 
-def _estimate(observer: Observer, mind: Mind) -> tuple[Tensor, Tensor, Tensor]:
+def estimate(observer: Observer, mind: Mind) -> tuple[Tensor, Tensor, Tensor]:
     """Inverse range along the cells, its variance, and whether they were seen."""
     moments = belief(mind.memory)
     if observer.fusion.chart == "inverse_range":
@@ -167,8 +176,8 @@ def study_fusion(cfg: DictConfig, rows: Rows) -> None:
                 for name, observer in observers.items():
                     minds[name] = perceive(observer, minds[name], matches, pose)
                     if t in marks:
-                        found.setdefault((name, t), []).append((*_estimate(observer, minds[name]), judge))
-        rows.rows += [(sensor, name, t, *_figures(parts)) for (name, t), parts in sorted(found.items(), key=_by_mark)]
+                        found.setdefault((name, t), []).append((*estimate(observer, minds[name]), judge))
+        rows.rows += [(sensor, name, t, *figures_of(parts)) for (name, t), parts in sorted(found.items(), key=_by_mark)]
 
 
 def _by_mark(item: tuple[tuple[str, int], Any]) -> int:
@@ -196,5 +205,5 @@ def study_encoders(cfg: DictConfig, rows: Rows) -> None:
                 matches, pose = arena.look(told, generator).matches, eyes(head, told)
                 minds = {name: perceive(observers[name], mind, matches, pose) for name, mind in minds.items()}
             for name, observer in observers.items():
-                found[name].append((*_estimate(observer, minds[name]), judge))
-        rows.rows += [(encoder_deg, name, *_figures(parts)) for name, parts in found.items()]
+                found[name].append((*estimate(observer, minds[name]), judge))
+        rows.rows += [(encoder_deg, name, *figures_of(parts)) for name, parts in found.items()]
