@@ -24,6 +24,7 @@ from torchfovea.metrics import gap
 from torchfovea.perception import Observer
 from torchfovea.reward import RewardBelief, range_from_inverse_range
 from torchfovea.setting import require
+from torchfovea.triangulation import rig_frame
 from torchfovea.tuning.scenes import Scenes, cast
 
 __all__ = [
@@ -134,9 +135,9 @@ def world_of(task: Task, scenes: Scenes, cells: Tensor, noise: Tensor) -> World:
 def glance(observer: Observer, pose: Eyes, point: Tensor, direction: Tensor, range_m: Tensor) -> tuple[Tensor, Tensor]:
     """Which points both retinas see, and the variance of their inverse range, to first order.
 
-    An error ε of one eye's ray inside the epipolar plane moves the point along the other eye's ray by ε s/sin δ, with
-    s its distance from the erring eye and δ the angle between the rays; the range from E changes by that times the
-    cosine between the unmoved ray and the cell's direction.
+    In the rig's frame, with slopes u = x/z and v = y/z of the eyes' rays, the point is Z ((u + u')/2, (v + v')/2, 1)
+    about the baseline's middle with Z = b/(u − u'), as in `torchfovea.triangulation.triangulate_rectified`; the noise
+    of each retina reaches the slopes through its eye's rotation.
 
     Args:
         observer: camera, retina and error budget.
@@ -149,33 +150,31 @@ def glance(observer: Observer, pose: Eyes, point: Tensor, direction: Tensor, ran
         bool (B, N) and (B, N) [1/m²], finite everywhere. Differentiable.
     """
     focal, retina = observer.camera.focal_px, observer.retina
-    left, right = point - pose.t_left.unsqueeze(-2), point - pose.t_right.unsqueeze(-2)
-    bx, by, bz = (pose.t_right - pose.t_left).unsqueeze(-2).unbind(-1)
-    lx, ly, lz = left.unbind(-1)
-    nx, ny, nz = by * lz - bz * ly, bz * lx - bx * lz, bx * ly - by * lx
-    area_square = (nx * nx + ny * ny + nz * nz).clamp(min=1e-12)
-    visible = torch.ones_like(range_m, dtype=torch.bool)
-    sides = []
-    for rotation, ray in ((pose.R_left, left), (pose.R_right, right)):
-        x, y, z = (ray @ rotation).unbind(-1)
-        square = (ray * ray).sum(-1).clamp(min=1e-8)
-        ahead = z > 1e-3
-        depth = torch.where(ahead, z, torch.ones_like(z))
-        px = focal * columns(x / depth, y / depth)
-        visible = visible & ahead & retina.inside(px)
-        sigma = eye_sigma_px(observer.budget, retina, px)
-        # the error's direction in the image: q = m × d for the plane's normal m and the ray d; 1 − q_z² shortens it
-        ax, ay, az = rotation[..., 2].unsqueeze(-2).unbind(-1)
-        dx, dy, dz = ray.unbind(-1)
-        q = nx * (dy * az - dz * ay) + ny * (dz * ax - dx * az) + nz * (dx * ay - dy * ax)
-        lateral = (1 - q * q / (area_square * square)).clamp(min=0)
-        error = (sigma * depth / focal).square() / square * lateral
-        sides.append((error, square, (direction * ray).sum(-1)))
-    (error_l, square_l, along_l), (error_r, square_r, along_r) = sides
-    # s_l s_r/|b × d_l s_l| = 1/sin δ; along = s cos
-    spread = error_r * square_r * square_r * along_l.square() + error_l * square_l * square_l * along_r.square()
-    inverse = 1 / range_m
-    return visible, (spread / area_square * inverse.square().square()).clamp(min=1e-12)
+    frame, middle, baseline = rig_frame(pose)
+    half = baseline[..., None] / 2
+    x, y, z = ((point - middle.unsqueeze(-2)) @ frame).unbind(-1)
+    ux, uy, uz = (direction @ frame).unbind(-1)
+    ahead = z > 1e-3
+    depth = torch.where(ahead, z, torch.ones_like(z))
+    v = y / depth
+    # of the range: by the slopes' mean and by their difference
+    along = ux * x + uy * y + uz * depth
+    by_mean, by_disparity, by_v = depth * ux / 2, depth * along / (2 * half), depth * uy / 2
+    visible = ahead
+    spread = torch.zeros_like(range_m)
+    for rotation, centre, sign in ((pose.R_left, pose.t_left, 1.0), (pose.R_right, pose.t_right, -1.0)):
+        cx, cy, cz = ((point - centre.unsqueeze(-2)) @ rotation).unbind(-1)
+        forward = cz > 1e-3
+        distance = torch.where(forward, cz, torch.ones_like(cz))
+        px = focal * columns(cx / distance, cy / distance)
+        visible = visible & forward & retina.inside(px)
+        sigma = eye_sigma_px(observer.budget, retina, px) / focal * (distance / depth)
+        u, by_u = (x + sign * half) / depth, by_mean - sign * by_disparity
+        turned = frame.mT @ rotation
+        for axis in (0, 1):
+            ax, ay, az = (turned[..., k, axis, None] for k in range(3))
+            spread = spread + (sigma * (by_u * (ax - u * az) + by_v * (ay - v * az))).square()
+    return visible, (spread / range_m.square().square()).clamp(min=1e-12)
 
 
 def look(task: Task, world: World, memory: Memory, pose: Eyes, t: int) -> Memory:

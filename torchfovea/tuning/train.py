@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -54,7 +55,7 @@ class Schedule:
     episodes: int = 2048
     scenes: int = 8
     estimator: str = "covered"
-    warm_episodes: int = 256
+    warm_episodes: int = 512
     warm_estimator: str = "coverage"
     rate: float = 0.1
     last_rate: float = 0.02
@@ -205,7 +206,7 @@ def _load(problem: Problem, schedule: Schedule, path: Path) -> State:
     try:
         content = torch.load(path, weights_only=True)
         made_with, state = content["made_with"], State(**content["state"])
-    except (OSError, KeyError, TypeError, EOFError, RuntimeError, ValueError) as error:
+    except (OSError, KeyError, TypeError, EOFError, RuntimeError, ValueError, pickle.UnpicklingError) as error:
         raise SettingError(
             f"checkpoint = {os.fspath(path)}: expected a checkpoint of torchfovea tune ({error})"
         ) from error

@@ -1,0 +1,345 @@
+"""Gradient estimators against explicit removal and finite differences; training, resuming and its refusals."""
+
+import json
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from torchfovea.camera import Pinhole
+from torchfovea.cli import main
+from torchfovea.experiments.build import build_cells
+from torchfovea.head import Head
+from torchfovea.perception import Observer
+from torchfovea.setting import SettingError
+from torchfovea.sphere import direction_mixture, log_density, log_normalizer, sphere_quadrature
+from torchfovea.tuning import train as training
+from torchfovea.tuning.baselines import SEARCHES, hand, table_1
+from torchfovea.tuning.bias import (
+    Bias,
+    Shape,
+    decode,
+    draw_cells,
+    encode,
+    fix_vector,
+    log_density_each,
+    log_normalizer_each,
+    mixture_of,
+    reachable,
+)  # fmt: skip
+from torchfovea.tuning.estimators import counterfactual
+from torchfovea.tuning.pathwise import panorama
+from torchfovea.tuning.prior_field import fit_by_gradient, fit_closed_form, look_up
+from torchfovea.tuning.problem import Problem, evaluate, play, prepare
+from torchfovea.tuning.scenes import Distribution, cast, draw_scenes, stream
+from torchfovea.tuning.simulator import Task, simulate
+from torchfovea.tuning.study import budgets_up_to, curves, finite_difference_check
+from torchfovea.tuning.train import ESTIMATORS, Schedule, train
+
+HEAD = Head()
+MEAN = [0.8, 0.4, -0.2]
+
+
+def problem(cells=30, saccades=6, distribution=None, dtype=torch.float32, **shape):
+    task = Task(Observer(camera=Pinhole.from_fov(90.0, 100.0)), saccades)
+    return Problem(task, distribution or Distribution(cans=3), Shape(**shape), cells, dtype)
+
+
+def vector(shape, mean=MEAN, variance=0.1, alpha=1.0):
+    return encode(shape, direction_mixture([1.0], [mean], [[variance] * 3], dtype=torch.float64), alpha)
+
+
+def test_densities_are_those_of_the_sphere():
+    mixture = direction_mixture(
+        [0.3, 0.7], [MEAN, [0.2, -0.5, 0.1]], [[0.1, 0.2, 0.05], [0.3, 0.1, 0.2]], dtype=torch.float64
+    )
+    bias = Bias(*(part[None] for part in mixture), torch.ones(()))
+    direction = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=-1)
+    torch.testing.assert_close(log_density_each(bias, direction[None])[0], log_density(mixture, direction))
+    quadrature = sphere_quadrature(3000, lambda d: reachable(HEAD, d), torch.float64)
+    torch.testing.assert_close(log_normalizer_each(bias, quadrature)[0], log_normalizer(mixture, quadrature))
+
+
+@pytest.mark.parametrize("components", [1, 3])
+def test_a_vector_is_its_mixture(components):
+    shape = Shape(components)
+    x = torch.randn(shape.size, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 0.5
+    fixed = fix_vector(shape, x)
+    torch.testing.assert_close(fix_vector(shape, fixed), fixed)
+    before, after = (decode(shape, v, torch.zeros(1, 2)) for v in (x, fixed))
+    direction = torch.nn.functional.normalize(torch.randn(1, 40, 3, dtype=torch.float64), dim=-1)
+    torch.testing.assert_close(log_density_each(before, direction), log_density_each(after, direction))
+    assert float(after.alpha) == pytest.approx(float(before.alpha))
+    again = encode(shape, mixture_of(shape, fixed), float(after.alpha))
+    torch.testing.assert_close(again, fixed)
+
+
+def test_a_conditioned_start_is_the_same_for_every_task():
+    shape = Shape(conditioned=True)
+    assert shape.size == 55
+    x = vector(shape)
+    bias = decode(shape, x, torch.tensor([[0.0, 0.0], [1.0, -0.7]], dtype=torch.float64))
+    torch.testing.assert_close(bias.means[0], bias.means[1])
+    moved = x.clone()
+    moved[9] = 0.3  # the first mean's slope in the task's azimuth
+    bias = decode(shape, moved, torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=torch.float64))
+    assert float(bias.means[1, 0, 0] - bias.means[0, 0, 0]) == pytest.approx(0.3)
+
+
+def test_cells_are_within_reach_and_follow_the_bias():
+    shape = Shape()
+    bias = decode(shape, vector(shape), torch.zeros(1, 2))
+    cells = draw_cells(bias, 4, 500, HEAD, torch.Generator().manual_seed(0))
+    assert reachable(HEAD, cells).all()
+    torch.testing.assert_close(cells.norm(dim=-1), torch.ones(4, 500, dtype=cells.dtype))
+    quadrature = sphere_quadrature(20000, lambda d: reachable(HEAD, d), torch.float64)
+    density = (log_density_each(bias, quadrature.directions[None])[0] - log_normalizer_each(bias, quadrature)).exp()
+    mean = (density * quadrature.solid_angle_sr) @ quadrature.directions
+    torch.testing.assert_close(cells.flatten(0, 1).mean(0), mean, atol=0.02, rtol=0)
+    beside = decode(shape, vector(shape) + 1e-6, torch.zeros(1, 2))
+    near = draw_cells(beside, 4, 500, HEAD, torch.Generator().manual_seed(0))
+    assert float((near - cells).abs().median()) < 1e-5
+
+
+def test_a_start_out_of_reach_is_refused():
+    shape = Shape()
+    behind = vector(shape, [-1.0, 0.0, 0.0], 0.001)
+    with pytest.raises(SettingError, match="do not overlap"):
+        train(problem(), behind, Schedule(episodes=32, warm_episodes=0, validation_scenes=2))
+
+
+def test_same_seed_same_episodes():
+    p = problem()
+    x = vector(p.shape)
+    first, second = (play(p, x, p.batch(5, stream("training", 3))) for _ in range(2))
+    assert torch.equal(first.cell, second.cell) and torch.equal(first.value, second.value)
+    assert not torch.equal(first.value, play(p, x, p.batch(5, stream("training", 4))).value)
+
+
+def test_a_cell_is_worth_what_its_removal_costs():
+    """Restarted counterfactuals equal whole episodes without the cell; cells never fixated are worth nothing."""
+    from torchfovea.tuning.estimators import _removals
+
+    p = problem(cells=12, saccades=5, dtype=torch.float64)
+    batch = p.batch(3, stream("training", 0))
+    bias = p.bias(vector(p.shape), batch.scenes)
+    world, run, credit, spent = _removals(p, bias, batch)
+    assert 0 < spent <= len(credit.scene)
+    found = {}
+    for scene, direction, weight in zip(*credit, strict=True):
+        cell = int((world.direction[scene] @ direction).argmax())
+        found[int(scene), cell] = float(weight)
+    for b in range(3):
+        for i in range(12):
+            one = world._replace(allowed=world.allowed.clone())
+            one.allowed[b, i] = False
+            loss = float((run.value - simulate(p.task, batch.scenes, one, bias.alpha).value)[b])
+            assert found.get((b, i), 0.0) == pytest.approx(loss, abs=1e-12)
+
+
+def test_leaving_one_out_is_unbiased_where_all_draws_can_be_listed():
+    """Three draws from four directions: the mean of Σ ∇log p(i) (R(P) − R(P∖i)) over all 64 is ∇E[R]."""
+    rng = np.random.default_rng(0)
+    worth = rng.random(4)
+
+    def value(drawn):  # of a set of cells, in their order: a greedy policy that may be misled
+        best, total = 0.0, 0.0
+        for cell in sorted(drawn, key=lambda c: -(worth[c] + 0.5 * (c % 2)))[:2]:
+            best = max(best, worth[cell])
+            total += best
+        return total
+
+    logits = torch.tensor([0.3, -0.2, 0.5, 0.0], dtype=torch.float64, requires_grad=True)
+    log_p = logits.log_softmax(0)
+    expected = torch.zeros((), dtype=torch.float64)
+    estimate = torch.zeros(4, dtype=torch.float64)
+    for drawn in np.ndindex(4, 4, 4):
+        probability = log_p[list(drawn)].sum().exp()
+        expected = expected + probability * value(drawn)
+        for k, cell in enumerate(drawn):
+            rest = value(drawn[:k] + drawn[k + 1 :])
+            slope = torch.autograd.grad(log_p[cell], logits, retain_graph=True)[0]
+            estimate += float(probability) * slope * (value(drawn) - rest)
+    torch.testing.assert_close(estimate, torch.autograd.grad(expected, logits)[0])
+
+
+@pytest.mark.slow
+def test_the_gradient_is_that_of_finite_differences():
+    p = problem(cells=40, saccades=6)
+    check = finite_difference_check(p, vector(p.shape, [0.8, 0.1, 0.0], 0.15), "covered", 640, step=0.2)
+    assert check["cosine"] > 0.9
+    assert 0.7 < check["norm_ratio"] < 1.3
+
+
+@pytest.mark.parametrize("name", list(ESTIMATORS))
+@pytest.mark.parametrize("shape", [{}, {"components": 2}, {"conditioned": True}, {"tune_alpha": False}], ids=str)
+def test_every_estimator_is_finite_and_counts(name, shape):
+    p = problem(cells=10, saccades=4, distribution=Distribution(cans=3, conditioned="conditioned" in shape), **shape)
+    p.quadrature  # noqa: B018 - built once
+    found = ESTIMATORS[name](p, vector(p.shape), p.batch(2, stream("training", 0)), alpha_share=0.5)
+    assert found.vector.shape == (p.shape.size,) and torch.isfinite(found.vector).all()
+    assert found.episodes >= 2 and found.runs >= 2
+
+
+def test_the_control_variate_leaves_the_mean_and_lowers_the_spread():
+    p = problem(cells=40, saccades=5)
+    x = vector(p.shape, [0.8, 0.45, -0.25], 0.05)
+    found = {n: [] for n in ("counterfactual", "covered")}
+    for k in range(30):
+        for name, parts in found.items():
+            parts.append(ESTIMATORS[name](p, x, p.batch(16, stream("training", 0, k)), alpha_share=0.0).vector)
+    plain, covered = (torch.stack(found[name]) for name in ("counterfactual", "covered"))
+    assert float(covered.std(0).norm()) < 0.9 * float(plain.std(0).norm())
+    difference = (plain - covered).mean(0)
+    error = (plain - covered).std(0) / math.sqrt(30)
+    assert float(difference.norm()) < 3 * float(error.norm())
+
+
+def test_training_gains_resumes_and_never_ends_below_its_start(tmp_path):
+    p = problem()
+    start = table_1(p.shape, "unbiased")
+    schedule = Schedule(episodes=160, scenes=4, warm_episodes=40, validations=2, validation_scenes=48)
+    whole = train(p, start, schedule, tmp_path / "whole.pt")
+    assert whole.best_value > whole.history[0][1] + 0.05
+    assert whole.best_value == max(v for _, v, _ in whole.history)
+
+    class Stopped(Exception):
+        pass
+
+    def stop(state, value):
+        if len(state.history) == 2:
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        train(p, start, schedule, tmp_path / "part.pt", stop)
+    again = train(p, start, schedule, tmp_path / "part.pt")
+    assert torch.equal(again.vector, whole.vector) and torch.equal(again.best, whole.best)
+    assert again.history == whole.history and again.episodes == whole.episodes
+    with pytest.raises(SettingError, match="checkpoint schedule"):
+        train(p, start, Schedule(episodes=161), tmp_path / "part.pt")
+    (tmp_path / "bad.pt").write_bytes(b"no checkpoint")
+    with pytest.raises(SettingError, match=r"bad\.pt"):
+        train(p, start, schedule, tmp_path / "bad.pt")
+
+
+def test_a_step_that_is_not_finite_stops_and_keeps_the_checkpoint(tmp_path, monkeypatch):
+    p = problem()
+    real, calls = ESTIMATORS["counterfactual"], []
+
+    def spoiled(*args, **settings):
+        calls.append(1)
+        found = real(*args, **settings)
+        return found if len(calls) < 3 else found._replace(vector=found.vector * math.nan)
+
+    monkeypatch.setitem(training.ESTIMATORS, "counterfactual", spoiled)
+    schedule = Schedule(1000, 2, "counterfactual", warm_episodes=0, validations=500, validation_scenes=4)
+    with pytest.raises(SettingError, match="not finite at step 2"):
+        train(p, vector(p.shape), schedule, tmp_path / "c.pt")
+    kept = torch.load(tmp_path / "c.pt", weights_only=True)["state"]
+    assert kept["step"] == 2 and torch.isfinite(kept["vector"]).all()
+
+
+def test_bad_schedules_and_shapes():
+    for settings, words in (
+        ({"estimator": "magic"}, "estimator = magic"),
+        ({"rate": 0.0}, "rate"),
+        ({"scenes": 0}, "scenes"),
+        ({"alpha_share": 2.0}, "alpha_share"),
+    ):
+        with pytest.raises(SettingError, match=words):
+            Schedule(**settings)
+    with pytest.raises(SettingError, match="components"):
+        Shape(0)
+    with pytest.raises(SettingError, match=r"acquisition\.alpha"):
+        vector(Shape(), alpha=0.0)
+    with pytest.raises(SettingError, match="components"):
+        encode(Shape(), direction_mixture([1.0, 1.0], [MEAN, MEAN], [[0.1] * 3] * 2), 1.0)
+
+
+@pytest.mark.parametrize("name", list(SEARCHES))
+def test_searches_spend_their_budget(name):
+    pytest.importorskip({"cma_es": "cma", "tpe": "optuna"}.get(name, "torch"))
+    p = problem(cells=8, saccades=3)
+    seen = list(SEARCHES[name](p, table_1(p.shape, "unbiased"), 48, 0, per_evaluation=4))
+    assert seen[-1][0] >= 48 and all(a < b for (a, _), (b, _) in pairwise(seen))
+    assert all(x.shape == (p.shape.size,) and torch.isfinite(x).all() for _, x in seen)
+
+
+def test_curves_and_hand():
+    assert budgets_up_to(600) == [128, 256, 512, 600]
+    p = problem(cells=20, saccades=4)
+    by_hand, sigma = hand(p, scenes=64, sigmas=(0.05, 0.16, 0.5))
+    assert sigma == 0.16
+    start = table_1(p.shape, "top")
+    better, worse = (evaluate(p, x, 64, stream("heldout", 0)) for x in (by_hand, start))
+    assert float((better - worse).mean()) > 0.1
+    rows = list(curves(p, start, ["coverage+none", "random"], 2, Schedule(episodes=150, validation_scenes=16), 16))
+    assert [row[:3] for row in rows[:4]] == [("coverage+none", s, b) for s in (0, 1) for b in (128, 150)]
+    assert len(rows) == 8
+
+
+def test_the_prior_field_is_the_moments_of_what_there_is():
+    scenes = draw_scenes(Distribution(cans=3), HEAD, 60, stream("training", 0))
+    direction = sphere_quadrature(3000, lambda d: reachable(HEAD, d)).directions
+    field = fit_closed_form(scenes, direction)
+    hits = cast(scenes, torch.zeros(60, 1, 3), direction.expand(60, -1, -1))
+    rho = np.where(hits.floor, 1 / 6, 1 / hits.range_m.numpy())
+    kernel = np.exp(150 * (direction @ direction.T - 1).numpy())
+    kernel /= kernel.sum(1, keepdims=True)
+    np.testing.assert_allclose(field.mean, kernel @ rho.mean(0), rtol=1e-4)
+    assert (field.std > 0).all()
+    mean, std = look_up(field, direction[None, :7])
+    assert mean.shape == std.shape == (1, 7)
+    learned = fit_by_gradient(scenes, direction, steps=30)
+    assert float((learned.mean - field.mean).abs().mean()) < 0.1
+    p = problem()
+    informed = Problem(p.task, p.distribution, p.shape, p.cells, field=field)
+    batch = informed.batch(3, stream("training", 0))
+    world = prepare(informed, informed.bias(vector(p.shape), batch.scenes), batch)
+    assert float(world.prior_mean.std()) > 0
+    assert np.isfinite(counterfactual(informed, vector(p.shape), batch).value)
+
+
+def test_the_blurred_panorama_has_a_gradient():
+    scenes = draw_scenes(Distribution(cans=3), HEAD, 2, stream("training", 0), torch.float64)
+    direction = torch.nn.functional.normalize(torch.tensor([[[1.0, 0.5, -0.2]], [[1.0, 0.4, -0.3]]]).double(), dim=-1)
+    direction.requires_grad_()
+    rho, floor = panorama(scenes, direction)
+    assert 0 <= float(floor.detach().min()) and float(floor.detach().max()) <= 1 + 1e-12
+    slope = torch.autograd.grad(rho.sum(), direction)[0]
+    assert torch.isfinite(slope).all() and float(slope.abs().max()) > 0
+
+
+def test_the_command_keeps_its_contract(tmp_path, capsys):
+    small = ["profile=quick", "episodes=40", "scenes=2", "memory.cells=12", "saccades=4", "validation_scenes=8"]
+    small += ["heldout_scenes=12", "check_episodes=8", "distribution.cans=3", "warm_episodes=8"]
+    study = ["study=true", "methods=[coverage,random]", "seeds=2"]
+    assert main(["tune", *small, *study, f"hydra.run.dir={tmp_path}/run"]) == 0
+    folder = tmp_path / "run"
+    assert capsys.readouterr().out.strip().splitlines()[-1] == str(folder)
+    result = json.loads((folder / "result.json").read_text())
+    for policy in ("unbiased", "top", "down", "target", "hand", "tuned", "prior_field", "tuned_with_prior_field"):
+        low, mid, high = (result[f"heldout.{policy}.{k}"] for k in ("ci_low", "gap_per_saccade", "ci_high"))
+        assert 0 <= low <= mid <= high <= 1
+    assert result["episodes_used"] >= 40 and -1 <= result["gradient_cosine"] <= 1 < 2 + result["gradient_norm_ratio"]
+    for name in ("bias.png", "learning.png", "gradient.png", "curves.png", "curves.csv", "tuning.csv", "checkpoint.pt"):
+        assert (folder / name).stat().st_size > 0
+    memory = OmegaConf.load(folder / "memory" / "tuned.yaml")
+    memory.cells = 30
+    cells = build_cells(OmegaConf.create({"memory": memory}), HEAD, torch.Generator().manual_seed(0))
+    assert cells.shape == (30, 3) and reachable(HEAD, cells).all()
+
+
+def test_the_commands_mistakes_are_one_line(tmp_path, capsys):
+    for settings, words in (
+        (["resume=nowhere.pt"], "resume = nowhere.pt"),
+        (["estimator=magic"], "estimator = magic"),
+        (["memory=geodesic"], "memory = geodesic"),
+        (["distribution.regions=[[100,120,0,10]]"], "distribution.regions"),
+        (["study=true", "methods=[magic]", "episodes=1", "validation_scenes=1", "heldout_scenes=2"], "methods = magic"),
+    ):
+        assert main(["tune", "profile=quick", "prior_field=false", *settings, f"hydra.run.dir={tmp_path}/bad"]) == 1
+        assert words in capsys.readouterr().err
