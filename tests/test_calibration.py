@@ -330,8 +330,8 @@ FIGURES = ("nees_mean", "coverage_50", "coverage_90", "coverage_95", "coverage_9
 
 
 def test_the_motorcycle_alone_and_its_budget_used(folder, capsys):
-    small = "sensor.receptive_fields=6000"
-    run, result = calibrate(capsys, "scenes=0", "real=true", small)
+    small = "sensor.receptive_fields=6000", "matcher.nearest_range_m=1.5"
+    run, result = calibrate(capsys, "scenes=0", "real=true", *small)
     for name in FIGURES:
         assert math.isfinite(result[f"before.{name}"]) and math.isfinite(result[f"after.{name}"])
     assert result["after.nll"] < result["before.nll"]
@@ -342,7 +342,7 @@ def test_the_motorcycle_alone_and_its_budget_used(folder, capsys):
     assert [row["model"] for row in whole] == ["before", "after"]
     assert float(whole[1]["nees_mean"]) == pytest.approx(result["after.nees_mean"])
     assert int(whole[0]["observations"]) == result["observations"]
-    assert main(["sense", "--config-dir", str(run), "budget=fitted", "pair=motorcycle", small]) == 0
+    assert main(["sense", "--config-dir", str(run), "budget=fitted", "pair=motorcycle", *small]) == 0
     sensed = json.loads((Path(capsys.readouterr().out.splitlines()[-1]) / "result.json").read_text())
     assert 0.9 < sensed["coverage_95"] < 0.98
 
@@ -383,3 +383,17 @@ def test_a_mistake_is_one_line_and_leaves_nothing(folder, capsys, overrides, lin
     assert printed.err.startswith("torchfovea calibrate: ") and len(printed.err.splitlines()) == 1, printed.err
     assert line in printed.err
     assert not list(folder.rglob("result.json"))
+
+
+@pytest.mark.parametrize("name", ["ours", "printed", "calibrated"])
+def test_the_budgets_that_come_along(name):
+    from hydra import compose, initialize_config_dir
+
+    from torchfovea.config import conf_dir
+    from torchfovea.experiments.build import construct
+
+    with initialize_config_dir(conf_dir(), version_base="1.3"):
+        cfg = compose("sense", [f"budget={name}"])
+    budget = construct(Budget, {**cfg.budget, "source_px": 400 if cfg.budget.source else None}, "budget")
+    expected = {"ours": Budget(), "printed": Budget.printed}.get(name, budget)
+    assert budget == expected and (budget.bend > 0) == (name == "calibrated")

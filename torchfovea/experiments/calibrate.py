@@ -38,7 +38,7 @@ BIN_COLUMNS = (
     *FIGURES,
 )  # fmt: skip
 QUICK = {"scenes": 2, "judged_scenes": 2, "looks": 2}
-FULL = {"scenes": 8, "judged_scenes": 8, "looks": 4}
+FULL = {"scenes": 16, "judged_scenes": 16, "looks": 2}
 JUDGED_SEEDS = 1000  # scenes to judge on have seeds from here, so that none is fitted on
 LEAST_IN_BIN = 50
 
@@ -205,7 +205,7 @@ def _write_budget(path: Path, numbers: dict[str, float], cfg: DictConfig, outlie
     lines = [
         "# An error budget fitted by torchfovea calibrate; torchfovea.correspondence.Budget says what the numbers are.",
         f"# Fitted on: {simulated}{real}; {cfg.sensor.layout}, {cfg.sensor.fov_deg:g} degrees, "
-        f"source {cfg.sensor.source_px} px, matcher {cfg.matcher.name}.",
+        f"source {cfg.sensor.source_px} px, matcher {cfg.matcher.name}",
         f"# Taken for outliers: {outliers:.2%}",
         *(f"{name}: {value:.5g}" for name, value in numbers.items()),
         "source: true",
