@@ -28,7 +28,7 @@ FLOORS = (
         "surfaces",
         "sweep",
         "disparity_files",
-        "external",
+        "external", "matchers",
         "rig",
         "rectified",
         "matching",

@@ -17,6 +17,7 @@ from torchfovea.files import write_figure
 from torchfovea.layout import Retina
 from torchfovea.metrics import information
 from torchfovea.retina import fovea, reconstruct
+from torchfovea.sweep import SweepRange
 from torchfovea.triangulation import Observations
 
 matplotlib.use("Agg")
@@ -32,6 +33,17 @@ def _kept(image: Tensor, retina: Retina) -> np.ndarray:
     """What the retina keeps of an image (3, H, W), as pixels (H, W, 3)."""
     kept, _ = reconstruct(fovea(image[None], None, retina), retina, (image.shape[-2], image.shape[-1]))
     return np.asarray(kept[0].movedim(0, -1).clamp(0, 1))
+
+
+def _found(found: Disparity | SweepRange, retina: Retina, size_px: int) -> tuple[np.ndarray, str]:
+    """What a matcher found as a picture, NaN where nothing, and its title."""
+    if isinstance(found, Disparity):
+        return np.where(np.asarray(found.valid), np.asarray(found.disparity), np.nan), (
+            "disparity of the rectified left view [px]"
+        )
+    both = torch.stack([found.inverse_range, found.valid.to(found.inverse_range)]).detach().cpu()
+    value, weight = reconstruct(both[None], retina, size_px)[0][0]
+    return np.asarray(torch.where(weight > 0.5, value / weight.clamp(min=0.5), torch.nan)), "inverse range found [1/m]"
 
 
 def _cross(axes: Axes, size: Sequence[int]) -> None:
@@ -104,10 +116,10 @@ def draw_episode(path: Path, episode: Episode, retina: Retina, title: str) -> No
             axes.imshow(np.asarray(picture).clip(0, 1))
             axes.set_title(f"{name} (last fixation at +)")
             _cross(axes, np.asarray(picture).shape[:2])
-        disparity = np.where(np.asarray(shown.disparity.valid), np.asarray(shown.disparity.disparity), np.nan)
-        drawn = row[3].imshow(disparity, cmap="viridis")
+        values, name = _found(shown.found, retina, left.shape[-1])
+        drawn = row[3].imshow(values, cmap="viridis")
         row[3].set_facecolor("0.85")
-        row[3].set_title("disparity of the rectified left view [px]")
+        row[3].set_title(name)
         figure.colorbar(drawn, ax=row[3], pad=0.015)
         for axes in row:
             axes.set_xticks([])

@@ -13,14 +13,17 @@ from torchfovea import sphere
 from torchfovea.camera import Camera, Fisheye, Pinhole
 from torchfovea.correspondence import Budget
 from torchfovea.egosphere import Fusion, Prior
+from torchfovea.external import External
 from torchfovea.head import Head, fixate
 from torchfovea.layout import LogPolar, Retina, Uniform
+from torchfovea.matchers import Matcher
 from torchfovea.perception import Eligibility, Observer
 from torchfovea.setting import SettingError, require
 from torchfovea.sgbm import SGBM
 from torchfovea.sim.arena import Arena
 from torchfovea.sim.scene import AttentionWorld, Cans, Room, Scene, build_scene
 from torchfovea.sim.world import World
+from torchfovea.sweep import Sweep
 from torchfovea.unscented import SigmaPoints
 
 __all__ = [
@@ -198,7 +201,8 @@ def build_arena(cfg: DictConfig, observer: Observer, seed: int) -> Arena:
     return Arena(world, observer, None if fidelity == "geometric" else matcher, sample, seed)
 
 
-def build_matcher(cfg: DictConfig) -> tuple[SGBM, float]:
-    """The stereo matcher's parameters and the nearest range that it searches."""
-    choice(cfg, "matcher.name", ("sgbm",))
-    return construct(SGBM, cfg.matcher, "matcher"), number(cfg, "matcher.nearest_range_m")
+def build_matcher(cfg: DictConfig) -> Matcher:
+    """The stereo matcher."""
+    kinds: dict[str, type[SGBM | Sweep | External]] = {"sgbm": SGBM, "sweep": Sweep, "external": External}
+    params = construct(kinds[choice(cfg, "matcher.name", tuple(kinds))], cfg.matcher, "matcher")
+    return Matcher(params, number(cfg, "matcher.nearest_range_m"), cfg.matcher.get("source"))

@@ -13,11 +13,12 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from torchfovea.characterization import PlaneSensor, matched_vergence
-from torchfovea.experiments.build import build_matcher, whole
+from torchfovea.experiments.build import construct, whole
 from torchfovea.files import write_csv
 from torchfovea.propagation import StereoCases, compare_gaussians, first_order, sample_moments, stereo_cases, unscented
 from torchfovea.realised import look_at_plane, off_lattice_distances, pool_sights, realised_information, rings_of_error
 from torchfovea.setting import require
+from torchfovea.sgbm import SGBM
 from torchfovea.unscented import SigmaPoints
 
 __all__ = [
@@ -128,7 +129,11 @@ def realise(
     """Textured planes drawn, matched and measured, at the vergence that meets them."""
     from torchfovea.pictures_sensor import draw_realised
 
-    matcher, planes, seed = build_matcher(cfg)[0], whole(cfg, "realised.planes"), whole(cfg, "seed", 0)
+    matcher, planes, seed = (
+        construct(SGBM, cfg.matcher, "matcher"),
+        whole(cfg, "realised.planes"),
+        whole(cfg, "seed", 0),
+    )
     edges = torch.tensor(RING_SHARES) * math.radians(cfg.sensor.fov_deg) / 2
     degrees = torch.rad2deg(edges).tolist()
     rows: list[tuple[Any, ...]] = []

@@ -22,10 +22,12 @@ from torchfovea.files import replacing, write_result
 from torchfovea.gaussian import Gaussian
 from torchfovea.head import Eyes
 from torchfovea.layout import Retina
+from torchfovea.matchers import Matcher, match_pair
 from torchfovea.metrics import coverage, nees_mean, outlier_share
-from torchfovea.rectified import RectifiedMatch, match_disparity, match_rectified
+from torchfovea.rectified import RectifiedMatch, match_disparity
 from torchfovea.retina import fovea
 from torchfovea.setting import SettingError, require
+from torchfovea.sgbm import SGBM
 from torchfovea.triangulation import Observations, observe
 from torchfovea.unscented import SigmaPoints
 
@@ -72,27 +74,21 @@ def run(cfg: DictConfig) -> float | None:
     """Sense a pair; the median depth error is what a sweeper sees, if there is truth."""
     every = choice(cfg, "sensor.layout", ("log_polar", "uniform", "every_pixel")) == "every_pixel"
     retina = None if every else build_sensor_of_pair(cfg)
-    matcher, nearest_m = build_matcher(cfg)
+    matcher = build_matcher(cfg)
     source = whole(cfg, "sensor.source_px", 16) if cfg.budget.source else None
     budget = construct(Budget, {**cfg.budget, "source_px": source}, "budget")
     printed = choice(cfg, "budget.sigma_points", ("ours", "paper")) == "paper"
     pair, gaze_px, folder = load_pair(cfg), _gaze(cfg), run_folder()
 
-    def sensed_with(layout: Retina | None) -> RectifiedMatch:
-        return match_rectified(
-            pair.left, pair.right, pair.camera_left, pair.camera_right, pair.baseline_m, layout, gaze_px, matcher,
-            budget, nearest_m,
-        )  # fmt: skip
-
-    sensed = sense(
-        pair, sensed_with(retina), retina, gaze_px, SigmaPoints.paper() if printed else SigmaPoints(), not printed
-    )
+    match = match_pair(matcher, *pair[:5], retina, gaze_px, budget)
+    sensed = sense(pair, match, retina, gaze_px, SigmaPoints.paper() if printed else SigmaPoints(), not printed)
     valid = sensed.observed.valid
     figures: dict[str, Any] = {"points": int(valid.sum()), "valid_fraction": float(valid.double().mean())}
     if pair.disparity is not None:
         figures.update(judge(pair, sensed, retina, gaze_px))
         if retina is not None:
-            plain = sensed_with(None).disparity
+            peer = matcher.params if isinstance(matcher.params, SGBM) else SGBM()
+            plain = match_pair(Matcher(peer, matcher.nearest_m), *pair[:5], None, gaze_px, budget).disparity
             again = _at(pair, plain.disparity, plain.valid, retina, gaze_px, budget)
             figures.update(_beside(pair, sensed, again, retina, gaze_px))
     _write(folder, sensed)

@@ -9,14 +9,15 @@ import torch
 from torch import Tensor
 
 from torchfovea.arena import Fixation, Look, Move, Truth
-from torchfovea.correspondence import Correspondences
+from torchfovea.correspondence import Correspondences, Disparity
 from torchfovea.geometric import correspond_points
 from torchfovea.head import Gaze, eyes
-from torchfovea.matching import Disparity, match_sgbm, verged
+from torchfovea.matchers import Matcher, match_eyes
 from torchfovea.perception import Observer
-from torchfovea.sgbm import SGBM
+from torchfovea.rig import verged
 from torchfovea.sim.truth import truth_of
 from torchfovea.sim.world import World
+from torchfovea.sweep import SweepRange
 
 __all__ = ["Arena", "Pictures", "draw_fields"]
 
@@ -27,12 +28,12 @@ class Pictures(NamedTuple):
     Attributes:
         left: the left eye's image, (3, H, W) in [0, 1].
         right: the right eye's.
-        disparity: of the rectified view.
+        found: what the matcher found, of the rectified view or along the left rays.
     """
 
     left: Tensor
     right: Tensor
-    disparity: Disparity
+    found: Disparity | SweepRange
 
 
 class Arena:
@@ -41,7 +42,7 @@ class Arena:
     Args:
         world: the scene with its head, renderer and motor.
         observer: whose retina and error budget the sensor has.
-        matcher: SGBM's parameters and the nearest range it searches [m]; None: the geometric sensor.
+        matcher: matches the images; None: the geometric sensor.
         sample: how many receptive fields a look goes through, drawn anew each time; None: all of them.
         seed: of the encoders' noise, where the observer's head has any: it then believes them, and the world does not.
     """
@@ -50,7 +51,7 @@ class Arena:
         self,
         world: World,
         observer: Observer,
-        matcher: tuple[SGBM, float] | None,
+        matcher: Matcher | None,
         sample: int | None = None,
         seed: int = 0,
     ) -> None:
@@ -82,14 +83,13 @@ class Arena:
         if self.matcher is not None:
             left, right = self.world.images(gaze)
             rig = verged(believed.vergence, observer.head.baseline_m)
-            params, nearest_m = self.matcher
-            matches, disparity = match_sgbm(
-                left.image, right.image, rig, observer.camera, observer.retina, params, observer.budget, nearest_m
+            matches, found = match_eyes(
+                self.matcher, left.image, right.image, rig, observer.camera, observer.retina, observer.budget
             )
             chosen = draw_fields(observer.retina.count, self.sample, generator)
             if chosen is not None:
                 matches = Correspondences(*(part[chosen] for part in matches))
-            return Look(matches, Pictures(left.image, right.image, disparity))
+            return Look(matches, Pictures(left.image, right.image, found))
         left_px = observer.retina.centers_px(dtype=gaze.pan.dtype)
         chosen = draw_fields(observer.retina.count, self.sample, generator)
         if chosen is not None:
