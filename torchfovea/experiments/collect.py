@@ -9,7 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from torchfovea.config import run_folder
-from torchfovea.experiments.manifest import read_result
+from torchfovea.experiments.manifest import MANIFEST, read_result
 from torchfovea.files import write_csv, write_result
 from torchfovea.setting import SettingError, require
 
@@ -46,11 +46,12 @@ def _say(line: str) -> None:
 
 
 def _overrides(folder: Path) -> dict[str, str]:
-    """The settings that the run was started with."""
-    try:
-        given = OmegaConf.load(folder / ".hydra" / "overrides.yaml")
-    except Exception as error:
-        raise SettingError(f"{folder}/.hydra/overrides.yaml: {error}: expected a run's settings") from None
+    """The settings that the run was made with; Hydra's own record would tell those of the last attempt."""
+    manifest = folder / MANIFEST
+    if not manifest.exists():
+        given: Any = OmegaConf.load(folder / ".hydra" / "overrides.yaml")
+    else:
+        given = read_result(manifest).get("overrides", [])
     pairs = (str(override).lstrip("+~").partition("=") for override in given)
     return {key: value for key, _, value in pairs}
 

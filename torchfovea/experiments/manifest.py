@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from torchfovea.files import write_json
@@ -16,7 +17,7 @@ __all__ = ["MANIFEST", "config_hash", "finished", "read_result"]
 
 MANIFEST = "manifest.json"
 # what does not change a run's figures
-INCIDENTAL = ("workers", "device", "batch")
+INCIDENTAL = ("workers", "device", "batch", "picture")
 
 
 def config_hash(cfg: DictConfig) -> str:
@@ -67,5 +68,7 @@ def finished(cfg: DictConfig, folder: Path, score: str = "gap_per_saccade") -> f
     if result.exists():
         value = read_result(result).get(score)
         return float("nan") if value is None else float(value)
-    write_json(manifest, {"config_hash": made_with, "settings": OmegaConf.to_container(cfg, resolve=True)})
+    overrides = list(HydraConfig.get().overrides.task) if HydraConfig.initialized() else []
+    settings = OmegaConf.to_container(cfg, resolve=True)
+    write_json(manifest, {"config_hash": made_with, "overrides": overrides, "settings": settings})
     return None

@@ -72,7 +72,8 @@ def run(cfg: DictConfig) -> float:
     write_csv(folder / "episodes.csv", EPISODE_COLUMNS, rows)
     write_csv(folder / "saccades.csv", SACCADE_COLUMNS, steps)
     assert last is not None
-    _draw(folder, cfg, observer.retina, last, rows[-1])
+    if cfg.picture:
+        _draw(folder, cfg, observer.retina, last, rows[-1])
     figures = summarize(rows)
     write_result(folder, figures)
     _print(figures)

@@ -1,0 +1,91 @@
+"""Rays traced as tensors meet what MuJoCo's rays meet, and arenas sensed together are arenas sensed alone."""
+
+import pytest
+import torch
+
+from torchfovea.arena import Together
+from torchfovea.camera import Pinhole
+from torchfovea.head import Gaze, eyes, to_ego
+from torchfovea.layout import LogPolar, Uniform
+from torchfovea.perception import Observer
+from torchfovea.sim.arena import Arena, draw_fields
+from torchfovea.sim.arenas import GeometricArenas
+from torchfovea.sim.cans import Cans
+from torchfovea.sim.model import EgoPose
+from torchfovea.sim.rays import cast
+from torchfovea.sim.scene import AttentionWorld, build_scene, stand_at
+from torchfovea.sim.trace import occluded, solids_of, trace
+from torchfovea.sim.world import World
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    moved = stand_at(build_scene(AttentionWorld(), 1), EgoPose(0.2, -0.3, 0.7))
+    return [build_scene(Cans(), 0), build_scene(AttentionWorld(), 0), moved]
+
+
+@pytest.fixture
+def gaze():
+    angles = ([0.3, -0.5, 0.1], [0.2, 0.0, 0.4], [0.2, 0.1, 0.3])
+    return Gaze(*(torch.tensor(a, dtype=torch.float64) for a in angles))
+
+
+@pytest.mark.parametrize("fov_deg", [90, 150])
+def test_the_same_surfaces_as_mujoco(scenes, gaze, fov_deg):
+    observer = Observer(camera=Pinhole.from_fov(fov_deg, 100), retina=Uniform(4000))
+    px = observer.retina.centers_px(dtype=torch.float64)
+    unit = torch.nn.functional.normalize(observer.camera.rays(px), dim=-1)
+    pose, solids = eyes(observer.head, gaze), solids_of(scenes)
+    direction = to_ego(pose.R_left, unit.expand(3, -1, -1))
+    range_m, geom = trace(solids, pose.t_left, direction)
+    points = pose.t_left[:, None] + range_m[..., None] * direction
+    hidden = occluded(solids, pose.t_right, points)
+    assert bool(hidden.any(1).all())
+    for b, scene in enumerate(scenes):
+        hits = cast(scene, pose.t_left[b], direction[b])
+        assert torch.allclose(range_m[b], hits.range_m, atol=1e-9, rtol=0)
+        assert torch.equal(geom[b], hits.geom)
+        world = World(scene, camera=observer.camera)
+        seen = world.correspond(Gaze(*(a[b] for a in gaze)), observer.camera.rays(px))
+        ahead = ((points[b] - pose.t_right[b]) * pose.R_right[b, :, 2]).sum(-1) > 0
+        assert torch.equal(seen.visible_right, (geom[b] >= 0) & ~hidden[b] & ahead)
+
+
+def test_float32_is_near_float64(scenes, gaze):
+    direction = torch.nn.functional.normalize(
+        torch.randn(3, 500, 3, generator=torch.Generator().manual_seed(0)), dim=-1
+    )
+    origin = torch.zeros(3, 3)
+    single, _ = trace(solids_of(scenes, dtype=torch.float32), origin, direction)
+    double, _ = trace(solids_of(scenes), origin.double(), direction.double())
+    assert single.dtype == torch.float32
+    assert ((single - double).abs() < 1e-3).double().mean() > 0.99
+
+
+@pytest.mark.parametrize("sample", [None, 300])
+def test_together_is_alone(scenes, gaze, sample):
+    observer = Observer(camera=Pinhole.from_fov(90, 100), retina=LogPolar(1000))
+    batch = GeometricArenas(scenes, observer, sample)
+    single = Together([Arena(World(s, camera=observer.camera), observer, None, sample) for s in scenes])
+    for a, b in zip(batch.saccade(gaze), single.saccade(gaze), strict=True):
+        for x, y in zip(a, b, strict=True) if isinstance(a, Gaze) else [(a, b)]:
+            assert torch.allclose(x, y, atol=1e-9)
+    for a, b in zip(batch.fixation(gaze), single.fixation(gaze), strict=True):
+        assert torch.allclose(a, b, atol=1e-9) if a.is_floating_point() else torch.equal(a, b)
+    looks = []
+    for arenas in (batch, single):
+        looks.append(arenas.look(gaze, [torch.Generator().manual_seed(k) for k in range(3)]).matches)
+    for a, b in zip(*looks, strict=True):
+        assert a.shape[1] == (sample or observer.retina.count)
+        assert torch.equal(a, b) if a.dtype == torch.bool else torch.allclose(a, b, atol=1e-8)
+
+
+def test_drawn_receptive_fields():
+    generator = torch.Generator().manual_seed(0)
+    assert draw_fields(10, None, generator) is None and draw_fields(10, 10, generator) is None
+    counts = torch.zeros(10)
+    for _ in range(400):
+        chosen = draw_fields(10, 4, generator)
+        assert len(chosen) == 4 and bool((chosen.diff() > 0).all())
+        counts[chosen] += 1
+    assert bool(((counts / 400 - 0.4).abs() < 0.1).all())
