@@ -162,7 +162,7 @@ def test_leaving_one_out_is_unbiased_where_all_draws_can_be_listed():
         for k, cell in enumerate(drawn):
             rest = value(drawn[:k] + drawn[k + 1 :])
             slope = torch.autograd.grad(log_p[cell], logits, retain_graph=True)[0]
-            estimate += float(probability) * slope * (value(drawn) - rest)
+            estimate += float(probability.detach()) * slope * (value(drawn) - rest)
     torch.testing.assert_close(estimate, torch.autograd.grad(expected, logits)[0])
 
 
