@@ -63,7 +63,7 @@ class Observer:
         camera: both eyes' camera, in retinal pixels.
         retina: both eyes' retina.
         budget: where a correspondence's standard deviation comes from.
-        points: sigma points of the unscented transform.
+        points: sigma points of the unscented transform; None: those that suit the chart.
         rotated: see `torchfovea.triangulation.sigma_root`.
         fusion: how observations enter the memory.
         prior: of a cell not yet seen.
@@ -76,7 +76,7 @@ class Observer:
     camera: Camera = field(default_factory=lambda: Pinhole.from_fov(135.0, 100.0))
     retina: Retina = field(default_factory=LogPolar)
     budget: Budget = field(default_factory=Budget)
-    points: SigmaPoints = field(default_factory=SigmaPoints)
+    points: SigmaPoints | None = None
     rotated: bool = True
     fusion: Fusion = field(default_factory=Fusion)
     prior: Prior = field(default_factory=Prior)

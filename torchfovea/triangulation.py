@@ -209,7 +209,8 @@ def observe(
         eyes: poses of the cameras in E, (...).
         camera: both eyes' camera, or the left one's, in retinal pixels.
         support_px: half the width of each left receptive field, (..., N) or (N,) [px].
-        points: sigma points of four dimensions; None: `SigmaPoints()`.
+        points: sigma points of four dimensions; None: `SigmaPoints()`, in the Cartesian chart
+            `SigmaPoints.midpoint()`.
         chart: `inverse_range` or `cartesian`.
         rotated: see `sigma_root`.
         right_camera: where the right eye has another.
@@ -224,7 +225,7 @@ def observe(
     Differentiable in the correspondences, their sigmas and the poses.
     """
     require(chart in ("inverse_range", "cartesian"), "chart", chart, "inverse_range or cartesian")
-    points = points or SigmaPoints()
+    points = points or (SigmaPoints.midpoint() if chart == "cartesian" else SigmaPoints())
     count = matches.valid.shape[-1]
     learning = torch.is_grad_enabled() and any(t.requires_grad for t in (*matches[:4], *eyes))
     if count <= BLOCK or learning or not matches.valid.device.type == "cpu":

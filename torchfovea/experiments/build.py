@@ -134,7 +134,7 @@ def build_observer(cfg: DictConfig) -> Observer:
             {**cfg.budget, "source_px": whole(cfg, "sensor.source_px", 16) if cfg.budget.source else None},
             "budget",
         ),
-        points=SigmaPoints.paper() if printed else SigmaPoints(),
+        points=SigmaPoints.paper() if printed else None,
         rotated=not printed,
         fusion=construct(Fusion, cfg.fusion, "fusion"),
         prior=construct(Prior, cfg.prior, "prior"),

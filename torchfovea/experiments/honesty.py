@@ -99,9 +99,9 @@ def propagate(
         ways = {
             "first_order": first_order(cases, chart),
             "ut_paper": unscented(cases, chart, SigmaPoints.paper(), False),
-            "ut_default": unscented(cases, chart, SigmaPoints(), True),
-            # at ±1 σ, right to fourth order for the midpoint of skew rays, D/(D² + v²) of both disparities
-            "ut_unit": unscented(cases, chart, SigmaPoints(4, 1.0, 1.0, -3.0), True),
+            "ut_default": unscented(
+                cases, chart, SigmaPoints.midpoint() if chart == "cartesian" else SigmaPoints(), True
+            ),
         }
         for way, belief in ways.items():
             error = torch.stack(compare_gaussians(cases, chart, belief, reference.moments), -1)

@@ -81,7 +81,7 @@ def run(cfg: DictConfig) -> float | None:
     pair, gaze_px, folder = load_pair(cfg), _gaze(cfg), run_folder()
 
     match = match_pair(matcher, *pair[:5], retina, gaze_px, budget)
-    sensed = sense(pair, match, retina, gaze_px, SigmaPoints.paper() if printed else SigmaPoints(), not printed)
+    sensed = sense(pair, match, retina, gaze_px, SigmaPoints.paper() if printed else None, not printed)
     valid = sensed.observed.valid
     figures: dict[str, Any] = {"points": int(valid.sum()), "valid_fraction": float(valid.double().mean())}
     if pair.disparity is not None:
@@ -115,7 +115,7 @@ def sense(
     match: RectifiedMatch,
     retina: Retina | None,
     gaze_px: tuple[float, float] | None,
-    points: SigmaPoints,
+    points: SigmaPoints | None,
     rotated: bool,
 ) -> Sensed:
     """Correspondences of a rectified pair as points with covariances, in the left camera's frame."""
