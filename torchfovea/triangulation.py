@@ -217,7 +217,8 @@ def observe(
 
     Returns:
         Observations. Valid are those whose nine sigma points all lie in front of both eyes (in inverse range: whose
-        rays look ahead, for infinity is an ordinary place there) and whose covariance is positive definite.
+        rays look ahead, for infinity is an ordinary place there), whose standard deviations are positive and whose
+        covariance is positive definite.
 
     Raises:
         SettingError: for an unknown chart.
@@ -285,7 +286,8 @@ def _observe(
         offsets = [_dot(e, x) * depth for e in tangents]
         first, second = moments((*offsets, w * _dot(x, x).rsqrt()), points)
     value, cov = columns(*first), columns(*second)
-    valid = matches.valid & in_front & positive_definite(cov) & torch.isfinite(value).all(-1)
+    sure = torch.minimum(matches.left_sigma_px, matches.right_sigma_px) > 0
+    valid = matches.valid & sure & in_front & positive_definite(cov) & torch.isfinite(value).all(-1)
     safe = columns(*(torch.full_like(valid, float(k in (0, 3, 5)), dtype=cov.dtype) for k in range(6)))
     centre = camera.rays(matches.left_px)
     support = support_px / camera.focal_px * (centre * centre).sum(-1).rsqrt()
