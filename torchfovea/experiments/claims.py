@@ -103,7 +103,7 @@ def read_claims(settings: Sequence[Mapping[str, Any]]) -> list[Claim]:
     Raises:
         SettingError: for a claim without a name, a name that comes twice, or settings that a claim does not have.
     """
-    claims = []
+    claims: list[Claim] = []
     for entry in settings:
         name = entry.get("id")
         known = Claim.__dataclass_fields__

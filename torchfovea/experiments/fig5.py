@@ -15,7 +15,7 @@ from torchfovea.characterization import (
     peak_vergence,
     spread_over_vergence,
 )
-from torchfovea.layout import LogPolar, Uniform
+from torchfovea.layout import LogPolar, Retina, Uniform
 
 __all__ = ["Fig5", "judge_fig5"]
 
@@ -33,7 +33,7 @@ def judge_fig5(settings: Mapping[str, Any], receptive_fields: int) -> tuple[list
         The claims as `claims.json` states them, and the curves: vergences, distances, information of both sensors.
     """
     camera = Pinhole.from_fov(90.0, 100.0)
-    layouts = {"log_polar": LogPolar(receptive_fields), "uniform": Uniform(receptive_fields)}
+    layouts: dict[str, Retina] = {"log_polar": LogPolar(receptive_fields), "uniform": Uniform(receptive_fields)}
     sensors = {name: PlaneSensor(camera, layout) for name, layout in layouts.items()}
     distance = torch.tensor(settings["distances_m"], dtype=torch.float32)
     vergence = torch.linspace(0, torch.pi / 2, int(settings["vergences"]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -128,7 +128,9 @@ def _fig9(folder: Path, plain: Row, rows: list[Row]) -> list[tuple[str, list[Pat
     return sections
 
 
-def _difference(rows: Sequence[Row], base: Sequence[Row], metric: str, level: float) -> tuple[float, float, float]:
+def _difference(
+    rows: Sequence[Mapping[str, Any]], base: Sequence[Mapping[str, Any]], metric: str, level: float
+) -> tuple[float, float, float]:
     then = {row["seed"]: row[metric] for row in base if row[metric] is not None}
     pairs = [row[metric] - then[row["seed"]] for row in rows if row[metric] is not None and row["seed"] in then]
     values = torch.tensor(pairs, dtype=torch.float64)

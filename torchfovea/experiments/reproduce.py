@@ -150,10 +150,10 @@ def _outcomes(tasks: list[Task], workers: int) -> Iterator[tuple[Task, list[Row]
         waiting = {pool.submit(run_task, task): task for task in tasks}
         try:
             for future in as_completed(waiting):
-                error = future.exception()
-                if error is not None and not isinstance(error, Exception):
-                    raise error
-                yield waiting[future], error if isinstance(error, Exception) else future.result()
+                broken = future.exception()
+                if broken is not None and not isinstance(broken, Exception):
+                    raise broken
+                yield waiting[future], broken if isinstance(broken, Exception) else future.result()
         except BaseException:
             for future in waiting:
                 future.cancel()

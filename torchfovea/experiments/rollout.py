@@ -67,16 +67,22 @@ def _aimed(cfg: DictConfig, scene: Scene) -> DictConfig:
     return merged
 
 
+def _settings(text: str) -> DictConfig:
+    cfg = OmegaConf.create(text)
+    assert isinstance(cfg, DictConfig)
+    return cfg
+
+
 @lru_cache(maxsize=64)
 def _scene(settings: str, head: Head, seed: int) -> Scene:
-    return build_scene_of(OmegaConf.create(settings), head, seed)
+    return build_scene_of(_settings(settings), head, seed)
 
 
 @lru_cache(maxsize=64)
 def _start(settings: str, observer: Observer, seed: int) -> tuple[Mind, Tensor]:
     """The memory of a seed, and where its generator stands after its cells were drawn."""
     generator = torch.Generator().manual_seed(seed)
-    mind = new_mind(observer, build_cells(OmegaConf.create(settings), observer.head, generator))
+    mind = new_mind(observer, build_cells(_settings(settings), observer.head, generator))
     return mind, generator.get_state()
 
 

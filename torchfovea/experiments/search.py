@@ -102,7 +102,7 @@ def _episodes(
             yield k, episode_row(episode), saccade_rows(episode), episode if k == final else None
         return
     # The last episode runs here, where it is drawn; the others in processes of their own.
-    settings = OmegaConf.to_yaml(OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"]), resolve=True)
+    settings = OmegaConf.to_yaml(OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"]), resolve=True)
     with ProcessPoolExecutor(workers, get_context("spawn"), torch.set_num_threads, (1,)) as pool:
         waiting = [pool.submit(_elsewhere, settings, seed) for seed in seeds[:-1]]
         try:

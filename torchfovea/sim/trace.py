@@ -7,7 +7,7 @@ the reference: with float64 the two agree to rounding.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -93,15 +93,19 @@ def solids_of(
     def tensor(values: object) -> Tensor:
         return torch.tensor(values, dtype=dtype, device=device)
 
+    walls, boxes, cylinders, spheres = (_group(found, tensor) for found in chosen.values())
     return Solids(
-        *(_group(chosen[name], tensor) for name in ("walls", "boxes", "cylinders", "spheres")),
+        walls,
+        boxes,
+        cylinders,
+        spheres,
         torch.tensor(floors, device=device),
         tensor(yaw).T[..., None].contiguous(),
         tensor(place).T[..., None].contiguous(),
     )
 
 
-def _group(scenes: list[list[tuple[int, Solid]]], tensor: object) -> _Group:
+def _group(scenes: list[list[tuple[int, Solid]]], tensor: Callable[[object], Tensor]) -> _Group:
     most = max(len(scene) for scene in scenes)
     rows = []
     for scene in scenes:
@@ -113,7 +117,6 @@ def _group(scenes: list[list[tuple[int, Solid]]], tensor: object) -> _Group:
         # far below and without size
         row += [(0.0, 0.0, -1e6, 0.0, 0.0, 0.0, 1.0, 0.0, -1.0)] * (most - len(row))
         rows.append(row)
-    assert callable(tensor)
     values = tensor(rows).reshape(len(scenes), most, 9).permute(2, 0, 1).contiguous()
     return _Group(values[:3, ..., None], values[3:6, ..., None], values[6:8, ..., None], values[8].long())
 
