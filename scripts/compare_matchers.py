@@ -1,7 +1,7 @@
 """Compare the foveated sweep with SGBM at the same receptive fields: `python scripts/compare_matchers.py --help`.
 
-On scenes of cans (the target fixated by verged eyes) and on the motorcycle pair, for both retinas. Errors are those of
-the right eye's pixel, in pixels of the source image; `bad` counts more than one of these, `wide` more than one RF width.
+On scenes of cans (the target fixated by verged eyes) and on the motorcycle pair, for both retinas. Errors are of the
+right eye's pixel, in pixels of the source image; `bad` counts more than one of these, `wide` more than one RF width.
 Medians and rates are over RFs that both matchers call valid and the right eye truly sees; `valid` is each matcher's own
 share of those seen.
 """

@@ -13,6 +13,8 @@ PACKAGE = ROOT / "torchfovea"
 FILES = sorted(PACKAGE.rglob("*.py"))
 LONGEST = 320
 
+PICTURES = {f"pictures{part}" for part in ("", "_memory", "_tuning", "_sensor", "_reproduce", "_calibration")}
+
 # From the ground up. A module imports from its own floor (never in a circle) or from those below it.
 FLOORS = (
     ("setting", "files"),
@@ -28,7 +30,8 @@ FLOORS = (
         "surfaces",
         "sweep",
         "disparity_files",
-        "external", "matchers",
+        "external",
+        "matchers",
         "rig",
         "rectified",
         "matching",
@@ -57,7 +60,7 @@ FLOORS = (
     ("perception", "arena"),
     ("tuning", "episode"),
     ("sim",),
-    ("pictures", "pictures_memory", "pictures_tuning", "pictures_sensor", "pictures_reproduce", "pictures_calibration", "config", "mistakes"),
+    (*PICTURES, "config", "mistakes"),
     ("cli", "experiments", "doctor", "bench", "__main__"),
 )
 FLOOR = {module: floor for floor, modules in enumerate(FLOORS) for module in modules}
@@ -67,7 +70,7 @@ ONLY_IN = {
     "mujoco": {"sim"},
     "hydra": {"cli", "config", "mistakes", "experiments"},
     "omegaconf": {"cli", "config", "mistakes", "experiments", "doctor"},
-    "matplotlib": {"pictures", "pictures_memory", "pictures_tuning", "pictures_sensor", "pictures_reproduce", "pictures_calibration"},
+    "matplotlib": PICTURES,
     "cv2": {"sgbm", "disparity_files", "bench", "experiments"},
     "rich": {"cli", "experiments", "doctor"},
     "skimage": {"experiments"},

@@ -98,13 +98,14 @@ def inverse3(sym: Tensor) -> Tensor:
     )
 
 
-def positive_definite(sym: Tensor) -> Tensor:
+def positive_definite(sym: Tensor, tolerance: float | None = None) -> Tensor:
     """Whether packed symmetric matrices are finite and positive definite, (..., 6) to bool (...).
 
-    Sylvester's criterion on the matrix scaled to a unit diagonal, whose minors must exceed the rounding of its dtype,
-    so that what passes can be inverted in it.
+    Sylvester's criterion on the matrix scaled to a unit diagonal, whose minors must exceed `tolerance`: by default the
+    rounding of its dtype, so that what passes can be inverted in it.
     """
-    tolerance = max(8 * torch.finfo(sym.dtype).eps, 1e-13)
+    if tolerance is None:
+        tolerance = max(8 * torch.finfo(sym.dtype).eps, 1e-13)
     xx, xy, xz, yy, yz, zz = sym.unbind(-1)
     diagonal = (xx > 0) & (yy > 0) & (zz > 0) & torch.isfinite(xx + yy + zz)
     one = torch.ones((), dtype=sym.dtype, device=sym.device)

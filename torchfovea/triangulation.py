@@ -239,8 +239,8 @@ def observe(
         part = Correspondences(*(t.narrow(axis, start, size) for t, axis in zip(matches, axes, strict=True)))
         support = support_px.narrow(-1, start, size)
         parts.append(_observe(part, eyes, camera, support, points, chart, rotated, right_camera or camera))
-    mean, cov, direction, support, valid = zip(*parts, strict=True)
-    return Observations(_join(mean), _join(cov), _join(direction), torch.cat(support, -1), torch.cat(valid, -1))
+    means, covs, directions, supports, valids = zip(*parts, strict=True)
+    return Observations(_join(means), _join(covs), _join(directions), torch.cat(supports, -1), torch.cat(valids, -1))
 
 
 def _join(parts: tuple[Tensor, ...]) -> Tensor:

@@ -140,12 +140,12 @@ def fixation_course(arena: Arena, cells: Tensor, saccades: int, seed: int) -> It
 
 def ways_to_fuse(base: Observer) -> dict[str, Observer]:
     """The three settings, and the default without its parts."""
-    cartesian = {"prior": Prior(4.0, 4.0)}
-    printed = {"prior": Prior(1000.0, 1000.0), "points": SigmaPoints.paper(), "rotated": False}
+    cartesian = replace(base, prior=Prior(4.0, 4.0))
+    printed = replace(base, prior=Prior(1000.0, 1000.0), points=SigmaPoints.paper(), rotated=False)
     point = replace(base.prior, slope_std=1e-3)
     return {
-        "printed": replace(base, fusion=Fusion("printed"), **printed),
-        "aligned": replace(base, fusion=Fusion("aligned"), **cartesian),
+        "printed": replace(printed, fusion=Fusion("printed")),
+        "aligned": replace(cartesian, fusion=Fusion("aligned")),
         "inverse_range, a cell a point": replace(base, fusion=Fusion(conflict=math.inf), prior=point),
         "inverse_range, a cell a patch": replace(base, fusion=Fusion(conflict=math.inf)),
         "inverse_range": replace(base, fusion=Fusion()),
