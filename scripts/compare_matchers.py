@@ -19,7 +19,7 @@ import torch
 
 from torchfovea.camera import Pinhole
 from torchfovea.correspondence import Correspondences
-from torchfovea.experiments.sense import _motorcycle
+from torchfovea.experiments.sense import motorcycle
 from torchfovea.head import eyes, fixate
 from torchfovea.layout import LogPolar, Retina, Uniform
 from torchfovea.matching import match_sgbm
@@ -91,7 +91,7 @@ def compare_cans(seed: int, retina: Retina, fov_deg: float, source_px: int) -> l
 
 def compare_motorcycle(retina: Retina) -> list[list[Any]]:
     """The motorcycle pair, looked at in its middle."""
-    pair = _motorcycle()
+    pair = motorcycle()
     options = {"retina": retina, "nearest_range_m": 1.0}
     cameras = pair.camera_left, pair.camera_right, pair.baseline_m
     truth = match_disparity(pair.disparity, *cameras, **options).correspondences

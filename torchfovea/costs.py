@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchfovea.camera import Camera, Pinhole
 from torchfovea.gaussian import columns
-from torchfovea.retina import Retina, _halve
+from torchfovea.retina import Retina, halve
 from torchfovea.sheets import Sheet, average
 
 __all__ = ["Eye", "Looks", "acuity", "correlate", "own_values", "project", "sheet_rays", "spread"]
@@ -91,7 +91,7 @@ def acuity(images: Tensor, retina: Retina, scale: float, middle: tuple[float, fl
     top = min(math.ceil(float(_level(rim, scale)) - 1e-3), int(math.log2(min(height, width))))
     pyramid = [images]
     for _ in range(top):
-        pyramid.append(_halve(pyramid[-1]))
+        pyramid.append(halve(pyramid[-1]))
     full = [images]
     for k in range(1, top + 1):
         rows, across = pyramid[k].shape[-2:]

@@ -197,7 +197,7 @@ def _read(image: Tensor, grid: Tensor) -> Tensor:
     return F.grid_sample(image, grid, padding_mode="border", align_corners=True)[:, :, 0]
 
 
-def _halve(image: Tensor) -> Tensor:
+def halve(image: Tensor) -> Tensor:
     """The next level of the pyramid, ⌈H/2⌉ × ⌈W/2⌉; replicated beyond the border."""
     return _halve_along(_halve_along(image, -2), -1) / 64
 
@@ -218,9 +218,9 @@ def _halve_along(image: Tensor, dim: int) -> Tensor:
 
 def _pyramid(image: Tensor, levels: int) -> Tensor:
     """Levels 1…`levels` of the pyramid, one below the other."""
-    pyramid = [_halve(image)]
+    pyramid = [halve(image)]
     for _ in range(levels - 1):
-        pyramid.append(_halve(pyramid[-1]))
+        pyramid.append(halve(pyramid[-1]))
     width = pyramid[0].shape[-1]
     return torch.cat([F.pad(level, (0, width - level.shape[-1])) for level in pyramid], -2)
 

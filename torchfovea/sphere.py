@@ -174,17 +174,17 @@ def log_density(mixture: DirectionMixture, directions: Tensor) -> Tensor:
     d = (w * y).sum(-1)
     # C - D² as a cross product: the difference itself would cancel.
     off_axis = torch.linalg.cross(w, y.expand_as(w)).square().sum(-1)
-    radial = _log_moment(d) - 0.5 * torch.where(d > -_tail(d.dtype)[0], off_axis, y.square().sum(-1))
+    radial = log_radial_moment(d) - 0.5 * torch.where(d > -deep_tail(d.dtype)[0], off_axis, y.square().sum(-1))
     log_det = mixture.cholesky.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     return torch.logsumexp(mixture.logits.log_softmax(-1) - _LOG_2PI - log_det - 3 * length.log() + radial, -1)
 
 
-def _tail(dtype: torch.dtype) -> tuple[float, int]:
+def deep_tail(dtype: torch.dtype) -> tuple[float, int]:
     """Where the tail formula takes over, at D <= -x, and how deep its continued fraction is."""
     return (2.5, 48) if dtype == torch.float64 else (1.5, 24)
 
 
-def _log_moment(d: Tensor) -> Tensor:
+def log_radial_moment(d: Tensor) -> Tensor:
     """Log of Q(D) = (1 + D²)Φ(D) + Dφ(D) for D > -x, and of exp(D²/2) Q(D) in the tail below.
 
     In the tail Q cancels to 2φ(D)/|D|³ (and so does the form with erfcx). With x = −D and the moments
@@ -192,7 +192,7 @@ def _log_moment(d: Tensor) -> Tensor:
     hence for r_n = J_n/J_{n−1} the continued fraction r_n = n/(x + r_{n+1}), which has positive terms only, and
     J_2 = r_1 r_2/(x + r_1).
     """
-    start, depth = _tail(d.dtype)
+    start, depth = deep_tail(d.dtype)
     tail = d <= -start
     body = torch.where(tail, torch.zeros_like(d), d)
     normal = torch.exp(-0.5 * body.square()) * (1 / math.sqrt(2 * math.pi))

@@ -31,7 +31,7 @@ from torchfovea.sgbm import SGBM
 from torchfovea.triangulation import Observations, observe
 from torchfovea.unscented import SigmaPoints
 
-__all__ = ["Pair", "Sensed", "load_pair", "run", "sense"]
+__all__ = ["Pair", "Sensed", "load_pair", "motorcycle", "run", "sense"]
 
 
 class Pair(NamedTuple):
@@ -209,7 +209,7 @@ def load_pair(cfg: DictConfig) -> Pair:
     """
     if cfg.pair is not None:
         choice(cfg, "pair", ("motorcycle",))
-        return _motorcycle()
+        return motorcycle()
     for name in ("left", "right"):
         if cfg[name] is None:
             raise SettingError(f"{name} = null: expected an image file (or pair=motorcycle)")
@@ -235,7 +235,7 @@ def load_pair(cfg: DictConfig) -> Pair:
     return Pair(left, right, Pinhole(focal, cx, cy), Pinhole(focal, cx + doffs, cy), baseline, truth)
 
 
-def _motorcycle() -> Pair:
+def motorcycle() -> Pair:
     """Middlebury 2014's motorcycle at a quarter of its size, as scikit-image ships it."""
     try:
         from skimage.data import stereo_motorcycle

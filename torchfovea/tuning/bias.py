@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchfovea.head import Head, fixate
 from torchfovea.setting import require
-from torchfovea.sphere import DirectionMixture, Quadrature, _log_moment, _tail, fix_gauge
+from torchfovea.sphere import DirectionMixture, Quadrature, deep_tail, fix_gauge, log_radial_moment
 
 __all__ = [
     "Bias", "Shape", "decode", "draw_cells", "encode", "features", "fix_vector", "log_density_each",
@@ -228,7 +228,7 @@ def log_density_each(bias: Bias, directions: Tensor) -> Tensor:
     w = w / length[..., None]
     d = (w * y).sum(-1)
     off_axis = torch.linalg.cross(w, y.expand_as(w)).square().sum(-1)
-    radial = _log_moment(d) - 0.5 * torch.where(d > -_tail(d.dtype)[0], off_axis, y.square().sum(-1))
+    radial = log_radial_moment(d) - 0.5 * torch.where(d > -deep_tail(d.dtype)[0], off_axis, y.square().sum(-1))
     log_det = bias.cholesky.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     weight = (bias.logits.log_softmax(-1) - math.log(2 * math.pi) - log_det)[:, None]
     return torch.logsumexp(weight - 3 * length.log() + radial, -1)
