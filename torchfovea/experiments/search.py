@@ -42,12 +42,12 @@ def run(cfg: DictConfig) -> float:
     """Run the episodes of a configuration; the mean gap per saccade is what a sweeper sees."""
     episodes, saccades, seed = whole(cfg, "episodes"), whole(cfg, "saccades"), whole(cfg, "seed", 0)
     observer, folder = build_observer(cfg), run_folder()
-    done = finished(cfg, folder)
-    if done is not None:
-        return done
     choice(cfg, "fidelity", ("photometric", "geometric"))
     choice(cfg, "motor", ("instant", "physics"))
     build_strategy(cfg, observer), build_matcher(cfg)  # mistakes come first, also in what is not used
+    done = finished(cfg, folder)
+    if done is not None:
+        return done
     bars = (
         TextColumn("{task.description}"),
         BarColumn(),
