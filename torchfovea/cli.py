@@ -69,6 +69,11 @@ COMMANDS: dict[str, Command] = {
         "draw and describe a memory's bias, or study how the memory fuses, moves and is drawn anew",
         "torchfovea memory memory=target",
     ),
+    "bench": Command(
+        "torchfovea.experiments.bench:run",
+        "how long the hot paths take, beside the peers that one would pick",
+        "torchfovea bench profile=quick",
+    ),
     "doctor": Command("torchfovea.doctor:run", "what this machine can render and has", "torchfovea doctor"),
 }
 

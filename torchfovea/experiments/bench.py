@@ -1,0 +1,291 @@
+"""``torchfovea bench``: how long the hot paths take, beside the peers that a user would pick."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import platform
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+from rich.table import Table
+
+from torchfovea.bench.paths import batched_steps, paths_of_saccade, saccade
+from torchfovea.bench.retina_paths import path_of_retina
+from torchfovea.bench.timing import Path, Peer, Timing, copy_bandwidth, interleaved, same, slope
+from torchfovea.camera import image_camera
+from torchfovea.config import run_folder
+from torchfovea.experiments.build import build_cells, build_observer, build_scene_of, choice, number, whole
+from torchfovea.experiments.rollout import roll_out
+from torchfovea.files import write_csv, write_result
+from torchfovea.head import Gaze, eyes
+from torchfovea.layout import LogPolar
+from torchfovea.perception import Observer
+from torchfovea.setting import require
+from torchfovea.sim import gl, rays
+from torchfovea.tuning.scenes import Distribution, draw_scenes
+from torchfovea.tuning.simulator import Task, World, simulate, world_of
+
+__all__ = ["run"]
+
+PATHS = ("retina", "triangulate_ut", "align", "fuse", "decide", "step", "render", "episode", "tune")
+SECONDS = {"quick": 0.5, "full": 3.0, "paper": 10.0}
+_COLUMNS = (
+    "path", "work", "device", "peer", "median_ms", "low_ms", "high_ms", "runs",
+    "peer_median_ms", "peer_low_ms", "peer_high_ms", "ratio", "bytes", "over_copy",
+    "slope_rfs", "slope_cells", "slope_batch",
+)  # fmt: skip
+_GROWTH_SHARE = 0.5  # of a path's seconds
+
+
+def run(cfg: DictConfig) -> float | None:
+    """Check, time, print and write; the ratio of the whole step is what a sweeper sees.
+
+    Raises:
+        SettingError: for a setting out of range, or cuda where there is none.
+        RuntimeError: where a path and a peer do not compute the same thing.
+    """
+    threads = torch.get_num_threads()
+    if cfg.threads is not None:
+        torch.set_num_threads(whole(cfg, "threads"))
+    try:
+        with torch.no_grad():
+            return _run(cfg)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _run(cfg: DictConfig) -> float | None:
+    device = choice(cfg, "device", ("cpu", "cuda"))
+    require(device == "cpu" or torch.cuda.is_available(), "device", device, "cpu, or cuda on a machine that has it")
+    profile = SECONDS[str(HydraConfig.get().runtime.choices["profile"])]
+    seconds = profile if cfg.seconds is None else number(cfg, "seconds")
+    wanted = PATHS if cfg.paths is None else tuple(cfg.paths)
+    for name in wanted:
+        require(name in PATHS, "paths", name, "some of " + ", ".join(PATHS))
+    console, folder = Console(), run_folder()
+    bandwidth = copy_bandwidth(seconds / 2, device)
+    figures: dict[str, Any] = {
+        "machine": torch.cuda.get_device_name() if device == "cuda" else platform.processor() or platform.machine(),
+        "device": device,
+        "threads": torch.get_num_threads(),
+        "copy_bandwidth_bytes_per_second": bandwidth,
+    }
+    figures |= {f"{name}.{key}": None for name in PATHS for key in ("median_ms", "peer_median_ms", "ratio")}
+    table = Table("path", "work", "ms", "peer", "its ms", "ratio", "x copy", "slopes", box=None, padding=(0, 2, 0, 0))
+    rows: list[list[Any]] = []
+    done: set[str] = set()
+    for builder in _builders(cfg, device, wanted):
+        for path in builder():
+            if path.name not in wanted:
+                continue
+            path.check()
+            timings = interleaved([path.run, *(peer.run for peer in path.peers)], seconds, device)
+            timings = [_scaled(t, s / path.units) for t, s in zip(timings, (1, *(p.scale for p in path.peers)), strict=True)]
+            slopes = {g.axis: _slope(g.sizes, g.runs, seconds, device) for g in path.growths}
+            floor_ms = 1e3 * path.moved / path.units / bandwidth
+            over = timings[0].median_ms / floor_ms if path.moved else None
+            new = _rows(path, timings, over, slopes)
+            rows += new
+            _tabulate(table, path, timings, over, slopes)
+            if path.name not in done:
+                done.add(path.name)
+                figures[f"{path.name}.median_ms"] = timings[0].median_ms
+                if path.peers:
+                    figures[f"{path.name}.peer_median_ms"] = timings[1].median_ms
+                    figures[f"{path.name}.ratio"] = timings[1].median_ms / timings[0].median_ms
+                figures |= {f"{path.name}.slope_{axis.lower()}": value for axis, value in slopes.items()}
+                figures[f"{path.name}.over_copy"] = over
+    console.print(
+        f"{device}, {figures['machine']}, {torch.get_num_threads()} threads; copies {bandwidth / 1e9:.1f} GB/s. "
+        "ms: median (quartiles). ratio: the peer's median over ours. x copy: over the time that copying the bytes takes."
+    )
+    console.print(table)
+    write_csv(folder / "bench.csv", _COLUMNS, rows)
+    write_result(folder, figures)
+    return figures["step.ratio"]
+
+
+def _scaled(timing: Timing, factor: float) -> Timing:
+    return Timing(*(factor * t for t in timing[:3]), timing.runs)
+
+
+def _slope(sizes: tuple[int, ...], runs: tuple[Callable[[], Any], ...], seconds: float, device: str) -> float:
+    """How the time of the whole call grows with its size."""
+    timings = interleaved(runs, _GROWTH_SHARE * seconds, device)
+    return slope(sizes, [t.median_ms for t in timings])
+
+
+def _rows(path: Path, timings: list[Timing], over: float | None, slopes: dict[str, float]) -> list[list[Any]]:
+    ours = timings[0]
+    grown = [slopes.get(axis) for axis in ("RFs", "cells", "batch")]
+    peers = [(peer.name, t) for peer, t in zip(path.peers, timings[1:], strict=True)] or [(None, None)]
+    moved = path.moved // path.units or None
+    return [
+        [
+            path.name, path.work, path.device, name, *ours,
+            *(theirs[:3] if theirs else (None,) * 3), theirs.median_ms / ours.median_ms if theirs else None,
+            moved, over, *grown,
+        ]
+        for name, theirs in peers
+    ]  # fmt: skip
+
+
+def _tabulate(table: Table, path: Path, timings: list[Timing], over: float | None, slopes: dict[str, float]) -> None:
+    def show(t: Timing) -> str:
+        return f"{t.median_ms:.3g} ({t.low_ms:.3g}-{t.high_ms:.3g})"
+
+    grown = ", ".join(f"{axis} {value:.2f}" for axis, value in slopes.items())
+    first = [path.name, path.work, show(timings[0])]
+    last = ["" if over is None else f"{over:.3g}", grown]
+    if not path.peers:
+        table.add_row(*first, "none", "", "", *last)
+    for peer, theirs in zip(path.peers, timings[1:], strict=True):
+        table.add_row(*first, peer.name, show(theirs), f"{theirs.median_ms / timings[0].median_ms:.3g}", *last)
+        first, last = ["", "", ""], ["", ""]
+
+
+def _builders(cfg: DictConfig, device: str, wanted: tuple[str, ...]) -> list[Callable[[], list[Path]]]:
+    """What makes the paths, each when its turn comes."""
+    full = build_observer(cfg)
+    require(isinstance(full.retina, LogPolar), "sensor.layout", cfg.sensor.layout, "log_polar, in bench")
+    require(cfg.sensor.camera == "pinhole", "sensor.camera", cfg.sensor.camera, "pinhole, in bench")
+    require(full.fusion.chart == "inverse_range", "fusion", full.fusion.name, "inverse_range, in bench")
+    require(full.points is None and full.rotated, "budget.sigma_points", "paper", "ours, in bench")
+    batch, source = whole(cfg, "batch"), whole(cfg, "sensor.source_px", 16)
+    # what the peers do not do: fill empty cells, keep two surfaces apart
+    fusion = dataclasses.replace(full.fusion, fill=False, conflict=math.inf, half_life=math.inf)
+    head = dataclasses.replace(full.head, encoder_deg=0.0)
+    plain = dataclasses.replace(full, fusion=fusion, head=head, reward="inverse_range")
+    small = dataclasses.replace(
+        plain, retina=dataclasses.replace(full.retina, receptive_fields=whole(cfg, "small.receptive_fields"))
+    )
+    few = OmegaConf.merge(cfg, {"memory": {"cells": whole(cfg, "small.cells")}})
+    assert isinstance(few, DictConfig)
+
+    def cells_of(settings: DictConfig) -> torch.Tensor:
+        return build_cells(settings, head, torch.Generator().manual_seed(int(cfg.seed)))
+
+    builders: list[tuple[tuple[str, ...], Callable[[], list[Path]]]] = [
+        (("retina",), lambda: path_of_retina(_log_polar(full), source, batch, device)),
+        (PATHS[1:6], lambda: paths_of_saccade(saccade(plain, cells_of(cfg), device), full)),
+        (("step",), lambda: [batched_steps(small, cells_of(few), batch, device)]),
+        (("episode",), lambda: [_episode(few, dataclasses.replace(full, retina=small.retina), batch, device)]),
+    ]
+    if device == "cpu":
+        builders += [
+            (("render",), lambda: [_render(cfg, full, source)]),
+            (("tune",), lambda: [_tune(cfg, full)]),
+        ]
+    return [build for names, build in builders if set(names) & set(wanted)]
+
+
+def _log_polar(observer: Observer) -> LogPolar:
+    assert isinstance(observer.retina, LogPolar)
+    return observer.retina
+
+
+def _render(cfg: DictConfig, observer: Observer, size: int) -> Path:
+    """One picture by rays, and by OpenGL where there is any."""
+    scene = build_scene_of(cfg, observer.head, int(cfg.seed))
+    zero = torch.zeros(())
+    pose = eyes(observer.head, Gaze(zero, zero + 0.3, zero + 0.1))
+    camera = image_camera(observer.camera, observer.retina.radius_px, size)
+    by_rays, by_gl = (
+        partial(module.render, scene, pose.R_left, pose.t_left, camera, size) for module in (rays, gl)
+    )
+    backend = gl.available_gl()
+
+    def check() -> None:
+        ours = by_rays()
+        hits = ours.geom >= 0
+        if not bool(hits.float().mean() > 0.5):
+            raise RuntimeError("render: rays that hit nothing")
+        if backend is not None:
+            same("render", ours.range_m[hits], by_gl().range_m[hits], 0.02, 0.97)
+
+    picture = by_rays()
+    return Path(
+        "render",
+        f"a picture of {size} x {size} by rays",
+        "cpu",
+        by_rays,
+        () if backend is None else (Peer(f"OpenGL, {backend}", by_gl),),
+        check,
+        sum(part.numel() * part.element_size() for part in picture),
+    )
+
+
+def _episode(cfg: DictConfig, observer: Observer, batch: int, device: str) -> Path:
+    """Geometric episodes that advance together, and the same one by one."""
+    cfg = cfg.copy()
+    cfg.device = device
+    cfg.sensor.sample = None
+    seeds = [int(cfg.seed) + number for number in range(batch)]
+
+    def together() -> list[Any]:
+        return roll_out(cfg, observer, seeds)
+
+    def alone() -> list[Any]:
+        return [roll_out(cfg, observer, [seed])[0] for seed in seeds]
+
+    def check() -> None:
+        for ours, theirs in zip(together(), alone(), strict=True):
+            same("episode", ours.direction[:2], theirs.direction[:2], 1e-3)
+            same("episode", ours.global_information[0], theirs.global_information[0], 1e-3)
+
+    looks = whole(cfg, "saccades")
+    return Path(
+        "episode",
+        f"of {looks} saccades, {observer.retina.count} RFs, {cfg.memory.cells} cells; {batch} together",
+        device,
+        together,
+        (Peer("one by one", alone),),
+        check,
+        units=batch,
+    )
+
+
+def _tune(cfg: DictConfig, observer: Observer) -> Path:
+    """Tuning's simulated episodes together, and the same one by one."""
+    episodes, cells = whole(cfg, "tuning.episodes", 8), whole(cfg, "tuning.cells", 2)
+    task = Task(observer, whole(cfg, "saccades", 2), number(cfg, "far_m"))
+    generator = torch.Generator().manual_seed(int(cfg.seed))
+    scenes = draw_scenes(Distribution(), observer.head, episodes, generator)
+    few = OmegaConf.merge(cfg, {"memory": {"cells": episodes * cells}})
+    assert isinstance(few, DictConfig)
+    directions = build_cells(few, observer.head, generator).reshape(episodes, cells, 3)
+    noise = torch.randn(task.saccades, episodes, cells, generator=generator)
+    world = world_of(task, scenes, directions, noise)
+    alpha = torch.ones(())
+    part = [torch.tensor([b]) for b in range(min(8, episodes))]
+    singles: list[tuple[Any, World]] = [(scenes.take(one), world.take(one)) for one in part]
+
+    def alone() -> torch.Tensor:
+        return torch.cat([simulate(task, *single, alpha).value for single in singles])
+
+    def together(count: int = episodes) -> torch.Tensor:
+        return simulate(task, *((scenes, world) if count == episodes else _first(scenes, world, count)), alpha).value
+
+    def check() -> None:
+        same("tune", together()[: len(part)], alone(), 1e-4, 0.99)
+
+    return Path(
+        "tune",
+        f"an episode of {task.saccades} saccades and {cells} cells; {episodes} together",
+        "cpu",
+        together,
+        (Peer(f"one by one, {len(part)} of them scaled", alone, episodes / len(part)),),
+        check,
+        units=episodes,
+    )
+
+
+def _first(scenes: Any, world: World, count: int) -> tuple[Any, World]:
+    index = torch.arange(count)
+    return scenes.take(index), world.take(index)
