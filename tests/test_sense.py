@@ -60,14 +60,14 @@ def test_the_motorcycle(folder, capsys):
 
 @pytest.mark.parametrize("sensor", ["log_polar", "uniform", "every_pixel"])
 def test_own_files_with_truth(folder, capsys, plane, sensor):
-    small = [] if sensor == "every_pixel" else ["sensor.receptive_fields=8000"]
+    small = ["matcher=sgbm"] if sensor == "every_pixel" else ["sensor.receptive_fields=8000"]
     _, result = sense(capsys, *plane, "disparity=truth.pfm", f"sensor={sensor}", *small)
     assert result["valid_fraction"] > 0.6
     assert result["median_error_m"] < 0.02
 
 
 def test_offset_axes_are_the_same_geometry(folder, capsys, plane):
-    run, _ = sense(capsys, *plane, "doffs_px=6", "sensor=every_pixel")
+    run, _ = sense(capsys, *plane, "doffs_px=6", "sensor=every_pixel", "matcher=sgbm")
     depth = np.median(np.load(run / "points.npz")["mean_m"][:, 2])
     assert depth == pytest.approx(FOCAL * BASELINE / 18, rel=0.01)
 

@@ -385,7 +385,7 @@ def test_memory_settings():
         elif setting["means"] is not None:  # some are aimed at a scene's target
             mixture = direction_mixture(setting["weights"], setting["means"], setting["covariances"])
             found[path.stem] = sample(mixture, 4000, 0)
-    assert len(found) == 8
+    assert found.keys() >= {"unbiased", "top", "down", "target", "target_printed", "equator", "antipodal", "multifocal"}
     assert float(found["unbiased"].mean(0).norm()) < 0.05
     assert float(found["top"][:, 2].mean()) > 0.5 and float(found["down"][:, 2].mean()) < -0.5
     target = found["target"].mean(0)
