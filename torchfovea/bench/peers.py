@@ -289,5 +289,3 @@ def step(
     bearing = bearing + add @ (2 / across)
     cells = np.ascontiguousarray(frames[..., 2])
     return decide(cells, vector, matrix, bearing, add @ ones > 0, head, prior, limits)
-
-

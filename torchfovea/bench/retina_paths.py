@@ -75,8 +75,9 @@ def _by_kornia(image: Tensor, plan: list[_Level], places: list[tuple[Tensor, ...
     count, now, at, out = plan[-1].last, image, 0, []
     for part, (x, y, weight) in zip(plan, places, strict=True):
         while at < part.level:
-            padded = F.pad(now, (1, 2 if now.shape[-1] % 2 == 0 else 3, 1, 2 if now.shape[-2] % 2 == 0 else 3), "replicate")
-            now, at = F.conv2d(padded, kernel, stride=2, groups=3)[..., : -(-now.shape[-2] // 2), : -(-now.shape[-1] // 2)], at + 1
+            height, width = ((side + 1) // 2 for side in now.shape[-2:])
+            padded = F.pad(now, (1, 3, 1, 3), "replicate")
+            now, at = F.conv2d(padded, kernel, stride=2, groups=3)[..., :height, :width], at + 1
         read = remap(now, x, y, mode="bilinear", padding_mode="border", align_corners=True)
         read = read.flatten(-2)[..., : part.last - part.first]
         out.append(F.pad(weight * read, (part.first, count - part.last)))

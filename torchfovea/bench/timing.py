@@ -113,17 +113,20 @@ def same(what: str, ours: Any, theirs: Any, tolerance: float, share: float = 1.0
         )
 
 
-def interleaved(runs: Sequence[Callable[[], Any]], seconds: float, device: str = "cpu") -> list[Timing]:
-    """Time functions in turns, each round in another order, after one call of each that does not count.
+def interleaved(
+    runs: Sequence[Callable[[], Any]], seconds: float, device: str = "cpu", warm: bool = False
+) -> list[Timing]:
+    """Time functions in turns, each round in another order.
 
     Args:
         runs: what to call.
         seconds: for all of them together; every one runs at least three times.
         device: waited for, where it is not the CPU.
+        warm: whether they have been called already; else each is called once first, which does not count.
     """
     wait = torch.cuda.synchronize if device.startswith("cuda") else lambda: None
     taken: list[list[float]] = [[] for _ in runs]
-    for run in runs:
+    for run in () if warm else runs:
         run()
     wait()
     begin = time.perf_counter()
@@ -136,7 +139,8 @@ def interleaved(runs: Sequence[Callable[[], Any]], seconds: float, device: str =
             runs[which]()
             wait()
             taken[which].append(1e3 * (time.perf_counter() - start))
-    return [Timing(*(float(q) for q in np.quantile(t, (0.5, 0.25, 0.75))), len(t)) for t in taken]
+    quartiles = [[float(q) for q in np.quantile(t, (0.5, 0.25, 0.75))] for t in taken]
+    return [Timing(middle, low, high, len(t)) for (middle, low, high), t in zip(quartiles, taken, strict=True)]
 
 
 def copy_bandwidth(seconds: float, device: str = "cpu") -> float:

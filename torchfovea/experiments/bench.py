@@ -6,7 +6,7 @@ import dataclasses
 import math
 import platform
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import torch
@@ -15,8 +15,10 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
 
-from torchfovea.bench.paths import batched_steps, paths_of_saccade, saccade
+from torchfovea.bench.look import Saccade, saccade
+from torchfovea.bench.paths import paths_of_look
 from torchfovea.bench.retina_paths import path_of_retina
+from torchfovea.bench.steps import batched_steps, paths_of_steps
 from torchfovea.bench.timing import Path, Peer, Timing, copy_bandwidth, interleaved, same, slope
 from torchfovea.camera import image_camera
 from torchfovea.config import run_folder
@@ -34,13 +36,14 @@ from torchfovea.tuning.simulator import Task, World, simulate, world_of
 __all__ = ["run"]
 
 PATHS = ("retina", "triangulate_ut", "align", "fuse", "decide", "step", "render", "episode", "tune")
-SECONDS = {"quick": 0.5, "full": 3.0, "paper": 10.0}
+SECONDS = {"quick": 0.4, "full": 3.0, "paper": 10.0}
 _COLUMNS = (
     "path", "work", "device", "peer", "median_ms", "low_ms", "high_ms", "runs",
     "peer_median_ms", "peer_low_ms", "peer_high_ms", "ratio", "bytes", "over_copy",
     "slope_rfs", "slope_cells", "slope_batch",
 )  # fmt: skip
-_GROWTH_SHARE = 0.5  # of a path's seconds
+_WIDTH = 170  # of the table in a file
+_GROWTH_SHARE = 0.4  # of a path's seconds
 
 
 def run(cfg: DictConfig) -> float | None:
@@ -68,7 +71,9 @@ def _run(cfg: DictConfig) -> float | None:
     wanted = PATHS if cfg.paths is None else tuple(cfg.paths)
     for name in wanted:
         require(name in PATHS, "paths", name, "some of " + ", ".join(PATHS))
-    console, folder = Console(), run_folder()
+    folder, console = run_folder(), Console()
+    if not console.is_terminal:
+        console = Console(width=_WIDTH)
     bandwidth = copy_bandwidth(seconds / 2, device)
     figures: dict[str, Any] = {
         "machine": torch.cuda.get_device_name() if device == "cuda" else platform.processor() or platform.machine(),
@@ -85,8 +90,9 @@ def _run(cfg: DictConfig) -> float | None:
             if path.name not in wanted:
                 continue
             path.check()
-            timings = interleaved([path.run, *(peer.run for peer in path.peers)], seconds, device)
-            timings = [_scaled(t, s / path.units) for t, s in zip(timings, (1, *(p.scale for p in path.peers)), strict=True)]
+            timings = interleaved([path.run, *(peer.run for peer in path.peers)], seconds, device, True)
+            scales = (1.0, *(peer.scale for peer in path.peers))
+            timings = [_scaled(t, scale / path.units) for t, scale in zip(timings, scales, strict=True)]
             slopes = {g.axis: _slope(g.sizes, g.runs, seconds, device) for g in path.growths}
             floor_ms = 1e3 * path.moved / path.units / bandwidth
             over = timings[0].median_ms / floor_ms if path.moved else None
@@ -103,7 +109,7 @@ def _run(cfg: DictConfig) -> float | None:
                 figures[f"{path.name}.over_copy"] = over
     console.print(
         f"{device}, {figures['machine']}, {torch.get_num_threads()} threads; copies {bandwidth / 1e9:.1f} GB/s. "
-        "ms: median (quartiles). ratio: the peer's median over ours. x copy: over the time that copying the bytes takes."
+        "ms: median (quartiles). ratio: the peer's median over ours. x copy: ms over the time to copy the bytes."
     )
     console.print(table)
     write_csv(folder / "bench.csv", _COLUMNS, rows)
@@ -112,7 +118,7 @@ def _run(cfg: DictConfig) -> float | None:
 
 
 def _scaled(timing: Timing, factor: float) -> Timing:
-    return Timing(*(factor * t for t in timing[:3]), timing.runs)
+    return Timing(factor * timing.median_ms, factor * timing.low_ms, factor * timing.high_ms, timing.runs)
 
 
 def _slope(sizes: tuple[int, ...], runs: tuple[Callable[[], Any], ...], seconds: float, device: str) -> float:
@@ -124,7 +130,10 @@ def _slope(sizes: tuple[int, ...], runs: tuple[Callable[[], Any], ...], seconds:
 def _rows(path: Path, timings: list[Timing], over: float | None, slopes: dict[str, float]) -> list[list[Any]]:
     ours = timings[0]
     grown = [slopes.get(axis) for axis in ("RFs", "cells", "batch")]
-    peers = [(peer.name, t) for peer, t in zip(path.peers, timings[1:], strict=True)] or [(None, None)]
+    peers: list[tuple[str | None, Timing | None]] = [
+        (peer.name, t) for peer, t in zip(path.peers, timings[1:], strict=True)
+    ]
+    peers = peers or [(None, None)]
     moved = path.moved // path.units or None
     return [
         [
@@ -144,7 +153,7 @@ def _tabulate(table: Table, path: Path, timings: list[Timing], over: float | Non
     first = [path.name, path.work, show(timings[0])]
     last = ["" if over is None else f"{over:.3g}", grown]
     if not path.peers:
-        table.add_row(*first, "none", "", "", *last)
+        table.add_row(*first, "", "", "", *last)
     for peer, theirs in zip(path.peers, timings[1:], strict=True):
         table.add_row(*first, peer.name, show(theirs), f"{theirs.median_ms / timings[0].median_ms:.3g}", *last)
         first, last = ["", "", ""], ["", ""]
@@ -171,9 +180,14 @@ def _builders(cfg: DictConfig, device: str, wanted: tuple[str, ...]) -> list[Cal
     def cells_of(settings: DictConfig) -> torch.Tensor:
         return build_cells(settings, head, torch.Generator().manual_seed(int(cfg.seed)))
 
+    @cache
+    def look() -> Saccade:
+        return saccade(plain, cells_of(cfg), device)
+
     builders: list[tuple[tuple[str, ...], Callable[[], list[Path]]]] = [
         (("retina",), lambda: path_of_retina(_log_polar(full), source, batch, device)),
-        (PATHS[1:6], lambda: paths_of_saccade(saccade(plain, cells_of(cfg), device), full)),
+        (PATHS[1:4], lambda: paths_of_look(look())),
+        (PATHS[4:6], lambda: paths_of_steps(look(), full)),
         (("step",), lambda: [batched_steps(small, cells_of(few), batch, device)]),
         (("episode",), lambda: [_episode(few, dataclasses.replace(full, retina=small.retina), batch, device)]),
     ]
@@ -196,9 +210,7 @@ def _render(cfg: DictConfig, observer: Observer, size: int) -> Path:
     zero = torch.zeros(())
     pose = eyes(observer.head, Gaze(zero, zero + 0.3, zero + 0.1))
     camera = image_camera(observer.camera, observer.retina.radius_px, size)
-    by_rays, by_gl = (
-        partial(module.render, scene, pose.R_left, pose.t_left, camera, size) for module in (rays, gl)
-    )
+    by_rays, by_gl = (partial(module.render, scene, pose.R_left, pose.t_left, camera, size) for module in (rays, gl))
     backend = gl.available_gl()
 
     def check() -> None:
@@ -269,8 +281,8 @@ def _tune(cfg: DictConfig, observer: Observer) -> Path:
     def alone() -> torch.Tensor:
         return torch.cat([simulate(task, *single, alpha).value for single in singles])
 
-    def together(count: int = episodes) -> torch.Tensor:
-        return simulate(task, *((scenes, world) if count == episodes else _first(scenes, world, count)), alpha).value
+    def together() -> torch.Tensor:
+        return simulate(task, scenes, world, alpha).value
 
     def check() -> None:
         same("tune", together()[: len(part)], alone(), 1e-4, 0.99)
@@ -284,8 +296,3 @@ def _tune(cfg: DictConfig, observer: Observer) -> Path:
         check,
         units=episodes,
     )
-
-
-def _first(scenes: Any, world: World, count: int) -> tuple[Any, World]:
-    index = torch.arange(count)
-    return scenes.take(index), world.take(index)

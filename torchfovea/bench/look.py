@@ -1,0 +1,90 @@
+"""One synthetic look of two eyes, from which the paths of a saccade start."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchfovea.correspondence import Correspondences
+from torchfovea.gaussian import columns
+from torchfovea.geometric import correspond_points
+from torchfovea.head import Eyes, eyes, fixate, to_ego
+from torchfovea.perception import Mind, Observer, new_mind
+
+__all__ = ["Saccade", "batch_of", "flat_of", "moved_to", "part_of", "saccade", "shares", "support_of"]
+
+
+class Saccade(NamedTuple):
+    """What a saccade starts from.
+
+    Attributes:
+        observer: of patches, without what its peers do not do.
+        mind: an empty memory.
+        matches: of a look (N,).
+        pose: of the eyes.
+    """
+
+    observer: Observer
+    mind: Mind
+    matches: Correspondences
+    pose: Eyes
+
+
+def moved_to(value: Any, device: str) -> Any:
+    """Tensors in nested tuples on another device."""
+    if isinstance(value, tuple):
+        return type(value)(*(moved_to(part, device) for part in value))
+    return value.to(device) if isinstance(value, Tensor) else value
+
+
+def saccade(observer: Observer, cells: Tensor, device: str = "cpu", seed: int = 0) -> Saccade:
+    """A look of both eyes at a rolling surface, with noise, and an empty memory over `cells` (Nx, 3)."""
+    gaze = fixate(observer.head, torch.tensor([1.2, 0.25, -0.1]))[0]
+    pose = eyes(observer.head, gaze)
+    left = observer.retina.centers_px("cpu", torch.float32)
+    ray = torch.nn.functional.normalize(to_ego(pose.R_left, observer.camera.rays(left)), dim=-1)
+    distance = 1.5 + 0.3 * torch.sin(3 * ray[:, 1:2]) + 0.2 * torch.cos(5 * ray[:, 2:])
+    points = pose.t_left + distance * ray
+    seen = torch.ones(len(left), dtype=torch.bool)
+    generator = torch.Generator().manual_seed(seed)
+    matches = correspond_points(points, seen, left, pose, observer.camera, observer.retina, observer.budget, generator)
+    return moved_to(Saccade(observer, new_mind(observer, cells), matches, pose), device)
+
+
+def part_of(look: Saccade, count: int) -> Saccade:
+    """The same with receptive fields drawn evenly from all of them."""
+    every = torch.linspace(0, look.matches.valid.shape[-1] - 1, count).long().to(look.matches.valid.device)
+    kept = [part[every] for part in look.matches]
+    kept = [columns(*part.unbind(-1)) if part.dim() == 2 else part for part in kept]
+    return look._replace(matches=Correspondences(*kept))
+
+
+def support_of(look: Saccade) -> Tensor:
+    """Half the width of each left receptive field [px]."""
+    return look.observer.retina.width_px(look.matches.left_px) / 2
+
+
+def flat_of(matches: Correspondences) -> tuple[Tensor, Tensor]:
+    """Places (N, 4) and standard deviations (N, 2), contiguous, as the peers want them."""
+    px = torch.cat([matches.left_px, matches.right_px], -1).contiguous()
+    return px, torch.stack([matches.left_sigma_px, matches.right_sigma_px], -1)
+
+
+def shares(most: int) -> tuple[int, ...]:
+    """A quarter, a half and all of a size."""
+    return tuple(max(64, most // share) for share in (4, 2, 1))
+
+
+def batch_of(looks: Sequence[Saccade]) -> Saccade:
+    """Saccades of equal sizes as one, memories indexed together."""
+    first = looks[0]
+    cells = torch.stack([look.mind.memory.cells.cpu() for look in looks])
+    device = str(first.mind.memory.cells.device)
+    matches = [torch.stack(parts) for parts in zip(*(look.matches for look in looks), strict=True)]
+    matches = [columns(*part.unbind(-1)) if part.dim() == 3 else part for part in matches]
+    pose = Eyes(*(torch.stack(parts) for parts in zip(*(look.pose for look in looks), strict=True)))
+    mind = moved_to(new_mind(first.observer, columns(*cells.unbind(-1))), device)
+    return Saccade(first.observer, mind, Correspondences(*matches), pose)
