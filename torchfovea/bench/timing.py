@@ -13,6 +13,7 @@ import torch
 __all__ = ["Growth", "Path", "Peer", "Timing", "copy_bandwidth", "interleaved", "nbytes", "same", "slope"]
 
 _FEWEST, _MOST = 3, 400  # rounds
+_REST_S = 0.02  # before each: threads of what ran last (BLAS, OpenMP) spin on for a while
 _COPIED = 16 << 20  # floats: far more than a cache holds
 
 
@@ -135,6 +136,7 @@ def interleaved(
             break
         for place in range(len(runs)):
             which = (place + turn) % len(runs)
+            time.sleep(_REST_S)
             start = time.perf_counter()
             runs[which]()
             wait()
