@@ -25,7 +25,7 @@ from torchfovea.unscented import SigmaPoints
 
 __all__ = ["paths_of_look"]
 
-_LOOPED, _FORCED = 200, 2000  # receptive fields that the slow peers go through
+_LOOPED, _FORCED = 100, 1000  # receptive fields that the slow peers go through
 
 
 def _observe(look: Saccade, support: Tensor) -> Observations:

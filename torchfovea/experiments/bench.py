@@ -36,7 +36,7 @@ from torchfovea.tuning.simulator import Task, World, simulate, world_of
 __all__ = ["run"]
 
 PATHS = ("retina", "triangulate_ut", "align", "fuse", "decide", "step", "render", "episode", "tune")
-SECONDS = {"quick": 0.4, "full": 3.0, "paper": 10.0}
+SECONDS = {"quick": 0.3, "full": 3.0, "paper": 10.0}
 _COLUMNS = (
     "path", "work", "device", "peer", "median_ms", "low_ms", "high_ms", "runs",
     "peer_median_ms", "peer_low_ms", "peer_high_ms", "ratio", "bytes", "over_copy",
