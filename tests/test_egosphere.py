@@ -226,9 +226,9 @@ def test_what_a_nearer_surface_hides_is_left_out_whatever_comes_first():
     near = torch.arange(60) % 3 == 0
     noise = 0.01 * torch.randn(60, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     both = nearnesses(torch.where(near, 1.5, 0.3) + noise, 0.01)
-    fusion = Fusion(gate_deg=5)
 
-    def rho(*masks):
+    def rho(*masks, erode=0.5):
+        fusion = Fusion(gate_deg=5, erode=erode)
         memory = new_egosphere(AHEAD, Prior())
         index, spacing = build_index(AHEAD), neighbour_spacing_rad(AHEAD)
         for mask in masks:
@@ -242,6 +242,9 @@ def test_what_a_nearer_surface_hides_is_left_out_whatever_comes_first():
     assert rho(near, ~near) == pytest.approx(1.5, abs=0.02)
     # contradicted again and again, the memory gives way
     assert rho(near, *[~near] * 20) == pytest.approx(0.3, abs=0.02)
+    # or at once
+    assert rho(near, ~near, erode=0.0) == pytest.approx(0.3, abs=0.02)
+    assert rho(~near, near, erode=0.0) == pytest.approx(1.5, abs=0.02)
     unheeded = enter(AHEAD, observed_at(direction, both), Fusion(gate_deg=5, conflict=math.inf))
     assert 0.4 < belief(unheeded).mean[0, 2].item() < 1.2
 

@@ -103,7 +103,7 @@ class Fusion:
         conflict: patches only. Two inverse ranges this many standard deviations apart are two surfaces, and E sees the
             nearer one alone; inf: they are averaged.
         erode: the share of its information that a cell keeps when a saccade sees past it: once it is the eyes'
-            parallax, again and again the memory was wrong.
+            parallax, again and again the memory was wrong. 0: the latest look is believed, which false matches need.
         half_life: saccades after which half of the information is forgotten; inf: never.
     """
 
@@ -112,7 +112,7 @@ class Fusion:
     gate_spacing: float = 2.0
     fill: bool = True
     conflict: float = 4.0
-    erode: float = 0.5
+    erode: float = 0.0
     half_life: float = math.inf
 
     def __post_init__(self) -> None:
@@ -171,8 +171,8 @@ def settle(memory: EgoSphere, pooled: Pooled, fusion: Fusion, prior: Prior) -> t
     """A z-buffer between what is remembered and what a saccade brought; patches only.
 
     Where the two are `fusion.conflict` standard deviations apart they are two surfaces. If the new one is nearer, the
-    cell forgets the old one, which it hides. If it is farther, the eyes looked past the old one: the new one is not
-    entered, and the old one keeps the share `fusion.erode` of its information.
+    cell forgets the old one, which it hides. If it is farther, the eyes looked past the old one, which keeps the share
+    `fusion.erode` of its information while the new one is not entered; with a share of 0 the new one takes its place.
 
     Differentiable; which is nearer is held fixed.
     """
@@ -183,7 +183,7 @@ def settle(memory: EgoSphere, pooled: Pooled, fusion: Fusion, prior: Prior) -> t
         apart = (new - old) * (new_variance + old_variance).rsqrt()
         nearer, farther = seen & (apart > fusion.conflict), seen & (apart < -fusion.conflict)
         keep = torch.where(farther, fusion.erode, (~nearer).to(apart.dtype))
-        take = (~farther).to(apart.dtype)
+        take = (~farther).to(apart.dtype) if fusion.erode > 0 else torch.ones_like(apart)
     memory = _blend(memory, prior, "inverse_range", keep)
     information = Information(*(take[..., None] * part for part in pooled.information))
     return memory, Pooled(information, take * pooled.bearing, take * pooled.hits)
