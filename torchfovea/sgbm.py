@@ -49,7 +49,7 @@ class SGBM:
     left_right_px: int = 1
     speckle_px: int = 50
     speckle_range_px: int = 2
-    mode: str = "3way"
+    mode: str = "hh"
     first_disparity_px: int | None = None
     disparities: int | None = None
     texture: float = 0.1
