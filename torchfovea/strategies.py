@@ -73,7 +73,7 @@ class View(NamedTuple):
 Strategy = Callable[[View], Tensor | tuple[Tensor, Any]]
 
 
-def upper_confidence_bound(view: View, alpha: float | Tensor = 2.0) -> Tensor:
+def upper_confidence_bound(view: View, alpha: float | Tensor = 1.0) -> Tensor:
     """μ + α σ (Eq. 41); `alpha` a number, inf allowed, or one for each row (...)."""
     return acquisition.upper_confidence_bound(view.mean, view.std, alpha)
 
@@ -258,5 +258,5 @@ def _source(view: View) -> Generators:
     return view.generator
 
 
-DEFAULT: Strategy = partial(upper_confidence_bound, alpha=2.0)
-"""The upper confidence bound with α = 2."""
+DEFAULT: Strategy = partial(upper_confidence_bound, alpha=1.0)
+"""The upper confidence bound with α = 1."""
