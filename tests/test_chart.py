@@ -12,7 +12,6 @@ from torchfovea.chart import (
     cartesian_from_inverse_range,
     inverse_range_coordinates,
     turn_cartesian,
-    turn_inverse_range,
 )
 from torchfovea.gaussian import Gaussian, columns, pack, unpack
 
@@ -88,15 +87,11 @@ def test_far_and_beyond_infinity_stay_finite():
 
 
 @given(st.integers(0, 10_000))
-def test_turns_are_the_smallest_rotation_in_both_charts(seed):
+def test_turns_are_the_smallest_rotation(seed):
     source, target, b = units(4, seed), units(4, seed + 1), belief(4, seed)
     source = torch.nn.functional.normalize(target + 0.5 * source, dim=-1)
-    turned = turn_inverse_range(b, source, target)
     cartesian = cartesian_from_inverse_range(b, source)
     want = turn_cartesian(cartesian, source, target)
-    got = cartesian_from_inverse_range(turned, target)
-    torch.testing.assert_close(got.mean, want.mean)
-    torch.testing.assert_close(got.cov, want.cov)
     for i in range(4):
         axis = np.cross(source[i], target[i])
         sine, cosine = np.linalg.norm(axis), float(source[i] @ target[i])
@@ -111,7 +106,6 @@ def test_turns_are_the_smallest_rotation_in_both_charts(seed):
     "function",
     [
         lambda m, c, n, t: tuple(cartesian_from_inverse_range(Gaussian(m, c), n)),
-        lambda m, c, n, t: tuple(turn_inverse_range(Gaussian(m, c), n, t)),
         lambda m, c, n, t: tuple(turn_cartesian(Gaussian(m, c), n, t)),
         lambda m, c, n, t: inverse_range_coordinates(m, c[..., 0], n),
     ],

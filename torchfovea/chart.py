@@ -22,7 +22,6 @@ __all__ = [
     "cartesian_from_inverse_range",
     "inverse_range_coordinates",
     "turn_cartesian",
-    "turn_inverse_range",
 ]
 
 
@@ -127,33 +126,3 @@ def turn_cartesian(belief: Gaussian, source: Tensor, target: Tensor) -> Gaussian
     # the columns of R are the images of the axes of E
     axes = torch.eye(3, dtype=source.dtype, device=source.device).expand(*source.shape[:-1], 3, 3).unbind(-2)
     return Gaussian(turn(belief.mean), _congruence(belief.cov, *(turn(axis) for axis in axes)))
-
-
-def turn_inverse_range(belief: Gaussian, source: Tensor, target: Tensor) -> Gaussian:
-    """The same turn in the inverse-range chart: ρ stays, the bearing offsets turn in their plane.
-
-    Args:
-        belief: (a, b, ρ) about `source`.
-        source: unit (..., 3).
-        target: unit (..., 3), not opposite to source.
-
-    Returns:
-        (a, b, ρ) about `target`. Differentiable.
-    """
-    e1, _ = basis(source)
-    f1, f2 = basis(target)
-    image = e1 - (_dot(target, e1) / (1 + _dot(source, target)))[..., None] * (source + target)
-    c, s = _dot(f1, image), _dot(f2, image)
-    a, b, rho = belief.mean.unbind(-1)
-    aa, ab, ar, bb, br, rr = belief.cov.unbind(-1)
-    return Gaussian(
-        columns(c * a - s * b, s * a + c * b, rho),
-        columns(
-            c * c * aa - 2 * c * s * ab + s * s * bb,
-            c * s * (aa - bb) + (c * c - s * s) * ab,
-            c * ar - s * br,
-            s * s * aa + 2 * c * s * ab + c * c * bb,
-            s * ar + c * br,
-            rr,
-        ),
-    )

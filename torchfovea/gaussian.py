@@ -18,7 +18,6 @@ __all__ = [
     "Gaussian",
     "Information",
     "columns",
-    "det3",
     "gaussian_from_information",
     "information_from_gaussian",
     "inverse3",
@@ -68,12 +67,6 @@ def pack(matrix: Tensor) -> Tensor:
 def unpack(sym: Tensor) -> Tensor:
     """Packed (..., 6) as symmetric matrices (..., 3, 3)."""
     return sym[..., torch.tensor([0, 1, 2, 1, 3, 4, 2, 4, 5], device=sym.device)].unflatten(-1, (3, 3))
-
-
-def det3(sym: Tensor) -> Tensor:
-    """Determinant of packed symmetric matrices, (..., 6) to (...)."""
-    xx, xy, xz, yy, yz, zz = sym.unbind(-1)
-    return xx * (yy * zz - yz * yz) + xy * (xz * yz - xy * zz) + xz * (xy * yz - xz * yy)
 
 
 def inverse3(sym: Tensor) -> Tensor:
