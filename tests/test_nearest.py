@@ -7,7 +7,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from torchfovea.nearest import build_index, nearest_cell, nearest_observation, neighbour_spacing_rad
+from torchfovea.nearest import (
+    _by_all_pairs,
+    _by_tree,
+    build_index,
+    join_indices,
+    nearest_cell,
+    nearest_observation,
+    neighbour_spacing_rad,
+)
 from torchfovea.setting import SettingError
 from torchfovea.sphere import (
     direction_mixture,
@@ -169,6 +177,16 @@ def test_many_sets_are_built_together():
     assert torch.equal(cell, torch.einsum("bnx,bkx->bnk", directions, cells).argmax(-1))
 
 
+def test_indices_joined_find_what_one_built_together_finds():
+    sets = torch.stack([SETS[name][:200] for name in ("random", "tight cluster", "latitude longitude")])
+    joined, together = join_indices([build_index(cells) for cells in sets]), build_index(sets)
+    directions = random_directions(3000, 5).view(3, 1000, 3)
+    for a, b in zip(nearest_cell(joined, directions), nearest_cell(together, directions), strict=True):
+        assert torch.equal(a, b)
+    with pytest.raises(SettingError, match="indices"):
+        join_indices([build_index(sets[0]), build_index(sets[1, :9])])
+
+
 def test_any_shape_and_length():
     index = build_index(7.0 * SETS["random"])
     directions = random_directions(24, 2)
@@ -276,9 +294,23 @@ def test_no_observation_and_no_cell():
     assert nearest_observation(cells, cells[:0], 0.1)[0].shape == (0,)
 
 
-def test_of_equally_near_observations_the_first():
+def test_of_equally_near_observations_one_always_the_same():
     directions = random_directions(5, 0).repeat(3, 1)
-    assert nearest_observation(directions, directions[:5], 0.05)[0].tolist() == [0, 1, 2, 3, 4]
+    first, again = (nearest_observation(directions, directions[:5], 0.05)[0] for _ in range(2))
+    assert (first % 5).tolist() == [0, 1, 2, 3, 4] and torch.equal(first, again)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_all_pairs_find_what_the_tree_finds(dtype):
+    # what a GPU does, on the CPU
+    directions = torch.stack((random_directions(300, 0), cluster(300, 1, 0.3))).to(dtype).double()
+    cells = torch.stack((random_directions(200, 3), cluster(200, 4, 0.3)))
+    asks, gate = torch.rand(2, 200, generator=torch.Generator().manual_seed(0)) < 0.7, torch.tensor(0.2, dtype=F64)
+    (a, far), (b, chord) = (search(directions, cells, asks, gate) for search in (_by_tree, _by_all_pairs))
+    near = far < math.inf
+    assert bool(near.any()) and torch.equal(near, asks & (chord <= far[near].max()))
+    assert torch.equal(a[near], b[near])
+    torch.testing.assert_close(far[near], chord[near])
 
 
 # ---------------------------------------------------------------- spacing and errors

@@ -16,7 +16,7 @@ from torchfovea.acquisition import known_well_enough
 from torchfovea.arena import Arena, Arenas, Fixation, Look, Move, Together, Truth, row, stack
 from torchfovea.head import Gaze, eyes, fixate
 from torchfovea.metrics import gap, global_information, local_information, near_target, regret, saccades_to_target
-from torchfovea.nearest import build_index
+from torchfovea.nearest import join_indices
 from torchfovea.perception import Mind, Observer, Step, decide, gaze_at, perceive
 from torchfovea.setting import require
 
@@ -36,9 +36,10 @@ __all__ = [
 
 
 def stack_minds(minds: Sequence[Mind]) -> Mind:
-    """Empty memories of the same number of cells as one batch (B, Nx), indexed together."""
+    """Empty memories of the same number of cells as one batch (B, Nx)."""
     memory = stack([mind.memory for mind in minds])
-    return Mind(memory, build_index(memory.cells), torch.stack([mind.spacing_rad for mind in minds]))
+    lookup = join_indices([mind.lookup for mind in minds])
+    return Mind(memory, lookup, torch.stack([mind.spacing_rad for mind in minds]))
 
 
 class Episode(NamedTuple):

@@ -7,17 +7,45 @@ Eq. 23 assigns an observation to the cell of the largest inner product (printed:
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from torchfovea.cell_index import SLOTS, CellIndex, arange, build_index, unit_cells
+from torchfovea.cell_index import SLOTS, CellIndex, build_index, unit_cells
 from torchfovea.setting import require
 
-__all__ = ["CellIndex", "build_index", "nearest_cell", "nearest_observation", "neighbour_spacing_rad"]
+__all__ = ["CellIndex", "build_index", "join_indices", "nearest_cell", "nearest_observation", "neighbour_spacing_rad"]
 
-_FIRST_BUCKET, _WIDEST_BUCKET = (0.004, 0.02), 0.1  # rad; range of the first, and beyond which there are none
+
+def join_indices(indices: Sequence[CellIndex]) -> CellIndex:
+    """What `build_index` gives for the stacked sets of one-set indices, without building them again.
+
+    Args:
+        indices: of one set each, with the same number of cells, in one dtype and on one device.
+
+    Raises:
+        SettingError: for none, an index of several sets, or sets of different sizes.
+    """
+    alike = len(indices) > 0 and all(one.batch is None and one.size == indices[0].size for one in indices)
+    require(alike, "indices", [(one.batch, one.size) for one in indices], "one or more of one set and size each")
+    table = 6 * indices[0].resolution ** 2  # rows of a set that come first; what they link to follows after all sets'
+    shift, links, after = (len(indices) - 1) * table, [], []
+    for one in indices:
+        moved = one.link + shift * one.link.sign()
+        links.append(moved[:table])
+        after.append(moved[table:])
+        shift += len(one.link) - table
+    parts = [slice(None, table), slice(table, None)]
+    return CellIndex(
+        torch.cat([one.vectors[:, part] for part in parts for one in indices], 1),
+        torch.cat([one.cells[part] for part in parts for one in indices]),
+        torch.cat(links + after),
+        indices[0].resolution,
+        indices[0].size,
+        len(indices),
+    )
 
 
 def nearest_cell(index: CellIndex, directions: Tensor) -> tuple[Tensor, Tensor]:
@@ -110,10 +138,8 @@ def nearest_observation(
 ) -> tuple[Tensor, Tensor]:
     """The observation nearest in direction to each cell, within a gate, exactly.
 
-    What `nearest_cell` is with the roles swapped, for observations that change with every saccade: they are sorted into
-    the buckets of a cube map as wide as the gate, and a cell looks into nine. Cells with wider gates than the narrowest
-    look again in wider buckets where they found nothing. The narrower the gate and the fewer cells are `wanted`, the
-    faster: cells with wide gates and no observation near cost as much as indexing the observations.
+    What `nearest_cell` is with the roles swapped, for observations that change with every saccade: SciPy's k-d tree on
+    the CPU, all pairs elsewhere. The fewer cells are `wanted`, the faster.
 
     Args:
         directions: of the observations, any positive length, (..., N, 3). Those that are zero or not finite do not
@@ -124,8 +150,8 @@ def nearest_observation(
 
     Returns:
         The observation's number, int64 (..., K), and the cosine between the two, (..., K). Where there is no
-        observation within the gate, the number 0 and the cosine -1. Of equally near observations the first. Not
-        differentiable.
+        observation within the gate, the number 0 and the cosine -1. Of equally near observations any one, always the
+        same for the same input. Not differentiable.
 
     Raises:
         SettingError: where the shapes do not fit or a gate is not positive.
@@ -133,125 +159,59 @@ def nearest_observation(
     sets, count = directions.shape[:-2], directions.shape[-2] if directions.ndim > 1 else 0
     good = directions.ndim > 1 and directions.shape[-1] == 3 and cells.shape[:-2] == sets and cells.shape[-1:] == (3,)
     require(good, "cells", tuple(cells.shape), f"the shape {(*sets, 'K', 3)} for directions {tuple(directions.shape)}")
-    gate = torch.as_tensor(gate_rad, dtype=cells.dtype, device=cells.device)
+    gate = torch.as_tensor(gate_rad, dtype=torch.float64, device=cells.device)
     require(bool((gate > 0).all()), "gate_rad", gate_rad, "positive angles")
-    gate = gate.broadcast_to(cells.shape[:-1]).reshape(-1).clamp(max=math.pi)
-    looking = arange(len(gate), gate) if wanted is None else wanted.reshape(-1).nonzero().squeeze(1)
-
-    o = directions.detach().to(cells.dtype).reshape(-1, 3)
-    largest = o.abs().amax(-1)
-    seen = ((largest > 0) & (largest < math.inf)).nonzero().squeeze(1)
-    o = torch.nn.functional.normalize(o.index_select(0, seen) / largest.index_select(0, seen)[:, None], dim=-1)
-    number = torch.zeros(len(gate), dtype=torch.int64, device=gate.device)
-    cosine = gate.new_full((len(gate),), -1)
-    if len(seen) == 0 or len(looking) == 0:
-        return number.view(cells.shape[:-1]), cosine.view(cells.shape[:-1])
-    c = cells.detach().reshape(-1, 3)
-    o_set = seen // count
-    reach = min(max(float(gate.index_select(0, looking).min()), _FIRST_BUCKET[0]), _FIRST_BUCKET[1])
-    while len(looking):
-        limit = gate.index_select(0, looking)
-        asking = (o, o_set, c.index_select(0, looking), looking // cells.shape[-2], limit)
-        found = _in_buckets(*asking, reach) if reach <= _WIDEST_BUCKET else _in_all(*asking)
-        hit = found >= 0
-        mine, nearest = looking[hit], found[hit]
-        number[mine] = seen.index_select(0, nearest) % count
-        cosine[mine] = 1 - 0.5 * (o.index_select(0, nearest) - c.index_select(0, mine)).square().sum(-1)
-        looking = looking[~hit & (limit > reach) & (reach <= _WIDEST_BUCKET)]
-        reach *= 4
-    return number.view(cells.shape[:-1]), cosine.view(cells.shape[:-1])
+    shape = cells.shape[:-1]
+    number, chord = torch.zeros(shape, dtype=torch.int64, device=cells.device), torch.full(shape, math.inf).to(gate)
+    asks = torch.ones_like(number, dtype=torch.bool) if wanted is None else wanted.expand(shape)
+    if count and bool(asks.any()):
+        x, y, z = directions.detach().unbind(-1)
+        largest = torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs())
+        seen = (largest > 0) & (largest < math.inf)
+        x, y, z = x / largest, y / largest, z / largest
+        length = (x * x + y * y + z * z).sqrt()
+        # those that do not count lie farther off than any that do
+        o = torch.stack([torch.where(seen, t / length, 9.0) for t in (x, y, z)], -1)
+        search = _by_tree if o.device.type == "cpu" else _by_all_pairs
+        found = search(o.view(-1, count, 3), cells.detach().reshape(-1, *cells.shape[-2:]), asks, gate)
+        number, chord = (part.view(shape) for part in found)
+    within = asks & (chord <= _chord(gate))
+    cosine = torch.where(within, 1 - 0.5 * chord * chord, -1.0).to(cells.dtype)
+    return torch.where(within, number, 0), cosine
 
 
 def _chord(angle: Tensor) -> Tensor:
     """Chord of an angle, with room for rounding."""
-    return 2 * torch.sin(0.5 * angle) * (1 + 4 * torch.finfo(angle.dtype).eps)
+    return 2 * torch.sin(0.5 * angle.clamp(max=math.pi)) * (1 + 4 * torch.finfo(angle.dtype).eps)
 
 
-def _in_all(o: Tensor, o_set: Tensor, c: Tensor, c_set: Tensor, gate: Tensor) -> Tensor:
-    """Nearest observation of each cell among all of its set; -1 where none is within the gate."""
-    found = torch.full((len(c),), -1, device=c.device)
-    fine_c, fine_o = (torch.nn.functional.normalize(t.double(), dim=-1) for t in (c, o))
-    for number in c_set.unique().tolist():
-        mine, theirs = (c_set == number).nonzero().squeeze(1), (o_set == number).nonzero().squeeze(1)
-        if len(theirs) == 0:
-            continue
-        if len(mine) * len(theirs) > 1 << 23:
-            best, _ = nearest_cell(build_index(fine_o.index_select(0, theirs)), fine_c.index_select(0, mine))
-        else:
-            best = (fine_c.index_select(0, mine) @ fine_o.index_select(0, theirs).T).argmax(-1)
-        nearest = theirs.index_select(0, best)
-        chord = (c.index_select(0, mine) - o.index_select(0, nearest)).norm(dim=-1)
-        found[mine] = torch.where(chord <= _chord(gate.index_select(0, mine)), nearest, -1)
-    return found
+def _by_tree(o: Tensor, c: Tensor, asks: Tensor, gate: Tensor) -> tuple[Tensor, Tensor]:
+    """Number of the nearest observation and its chord, infinite where none lies within the widest gate."""
+    number = torch.zeros(c.shape[:-1], dtype=torch.int64)
+    chord = torch.full(c.shape[:-1], math.inf, dtype=torch.float64)
+    reach = float(_chord(gate).max()) * (1 + 1e-6)
+    for k, mask in enumerate(asks.view(chord.shape)):
+        tree = cKDTree(o[k].numpy(), balanced_tree=False, compact_nodes=False)  # quick to build: it serves once
+        far, nearest = tree.query(c[k][mask].numpy(), distance_upper_bound=reach)
+        chord[k, mask] = torch.from_numpy(far)
+        number[k, mask] = torch.from_numpy(nearest)
+    return number, chord
 
 
-def _face_angles(direction: Tensor, face: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Equal-angle coordinates on a face 0...5 (axis, then sign) of the cube, and the component along its axis."""
-    axis = face // 2
-    major = direction.gather(-1, axis[:, None]).squeeze(-1) * (1 - 2 * (face % 2))
-    a, b = (direction.gather(-1, ((axis + k) % 3)[:, None]).squeeze(-1) for k in (1, 2))
-    return torch.atan2(a, major), torch.atan2(b, major), major
-
-
-def _own_face(direction: Tensor) -> Tensor:
-    axis = direction.abs().argmax(-1)
-    return 2 * axis + (direction.gather(-1, axis[:, None]).squeeze(-1) < 0)
-
-
-def _in_buckets(o: Tensor, o_set: Tensor, c: Tensor, c_set: Tensor, gate: Tensor, reach: float) -> Tensor:
-    """Nearest observation of each cell within min(gate, reach); -1 where there is none.
-
-    An angle changes an equal-angle coordinate by at most sqrt(1 + tan²) of the largest coordinate times itself.
-    """
-    width = reach * math.sqrt(2)
-    for _ in range(8):
-        width = 1.001 * reach * math.hypot(1, math.tan(math.pi / 4 + width))
-    edge = math.pi / 4 + width
-    buckets = math.ceil(2 * edge / width) + 1
-
-    # Each observation lies on its face and, near an edge, also in the margin of the face beyond.
-    own = _own_face(o)
-    a, b, _ = _face_angles(o, own)
-    entries = [(arange(len(o), o), own, a, b)]
-    margin = (torch.maximum(a.abs(), b.abs()) >= math.pi / 4 - 1.01 * width).nonzero().squeeze(1)
-    for beyond in range(6) if len(margin) else ():
-        other = torch.full_like(margin, beyond)
-        a, b, major = _face_angles(o.index_select(0, margin), other)
-        inside = (major > 0) & (a.abs() < edge) & (b.abs() < edge) & (own.index_select(0, margin) != beyond)
-        entries.append((margin[inside], other[inside], a[inside], b[inside]))
-    number, face, a, b = (torch.cat(t) for t in zip(*entries, strict=True))
-
-    def bucket(sets: Tensor, faces: Tensor, a: Tensor, b: Tensor) -> Tensor:
-        i, j = (((t + edge) / width).long().clamp_(0, buckets - 1) for t in (a, b))
-        return ((6 * sets + faces) * buckets + i) * buckets + j
-
-    key, order = bucket(o_set.index_select(0, number), face, a, b).sort(stable=True)
-    number = number.index_select(0, order)
-    total = (int(torch.maximum(o_set.max(), c_set.max())) + 1) * 6 * buckets**2
-    starts = torch.cat((key.new_zeros(1), torch.bincount(key, minlength=total).cumsum(0)))
-
-    own = _own_face(c)
-    a, b, _ = _face_angles(c, own)
-    home = bucket(c_set, own, a, b)[:, None] + buckets * torch.tensor([-1, 0, 1], device=c.device)
-    low, high = (starts[(home + k).clamp_(0, total)] for k in (-1, 2))  # three runs of three buckets each
-    found = torch.full((len(c),), -1, device=c.device)
-    pairs = (high - low).sum(-1).cumsum(0)
-    cuts = torch.searchsorted(pairs, torch.arange(0, int(pairs[-1]) + 1, 1 << 22, device=c.device), right=True).tolist()
-    for begin, end in zip(cuts, [*cuts[1:], len(c)], strict=True):
-        run = (high[begin:end] - low[begin:end]).reshape(-1)
-        which = arange(len(run), run).repeat_interleave(run)
-        shift = low[begin:end].reshape(-1) - (run.cumsum(0) - run)
-        candidate = number.index_select(0, arange(len(which), which) + shift.index_select(0, which))
-        asking = which // 3
-        offset = o.index_select(0, candidate) - c[begin:end].index_select(0, asking)
-        distance = offset.square_().sum(-1)
-        limit = _chord(gate[begin:end].clamp(max=reach)).square()
-        nearest = limit.scatter_reduce(0, asking, distance, "amin")
-        best = (distance == nearest.index_select(0, asking)).nonzero().squeeze(1)
-        first = torch.full((end - begin,), len(o), device=c.device)
-        first.scatter_reduce_(0, asking.index_select(0, best), candidate.index_select(0, best), "amin")
-        found[begin:end] = torch.where(first < len(o), first, -1)
-    return found
+def _by_all_pairs(o: Tensor, c: Tensor, asks: Tensor, gate: Tensor) -> tuple[Tensor, Tensor]:
+    """Number of the nearest observation and its chord; `gate` is not used."""
+    asks = asks.view(c.shape[:-1])
+    most = int(asks.sum(-1).max())
+    asking = asks.to(torch.uint8).argsort(dim=-1, descending=True, stable=True)[:, :most]
+    number, chord = torch.zeros_like(asks, dtype=torch.int64), torch.full_like(c[..., 0], math.inf).double()
+    block = max(1, (1 << 26) // (len(o) * o.shape[1]))
+    for row in asking.split(block, dim=-1):
+        ask = c.gather(1, row[..., None].expand(-1, -1, 3)).to(o)
+        # by differences: products would round what lies close together
+        far, nearest = torch.cdist(ask, o, compute_mode="donot_use_mm_for_euclid_dist").min(-1)
+        number.scatter_(1, row, nearest)
+        chord.scatter_(1, row, far.double())
+    return number, chord
 
 
 def neighbour_spacing_rad(cells: Tensor, neighbours: int = 6) -> Tensor:

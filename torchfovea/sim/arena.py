@@ -112,4 +112,6 @@ def draw_fields(count: int, sample: int | None, generator: torch.Generator) -> T
     """Some of `count` receptive fields, each with the same chance, in ascending order; None: all of them."""
     if sample is None or sample >= count:
         return None
-    return torch.randperm(count, generator=generator, device=generator.device)[:sample].sort().values.cpu()
+    chosen = torch.zeros(count, dtype=torch.bool, device=generator.device)
+    chosen[torch.randperm(count, generator=generator, device=generator.device)[:sample]] = True
+    return chosen.nonzero()[:, 0].cpu()

@@ -15,9 +15,8 @@ from torchfovea.perception import Observer
 from torchfovea.sim.arena import draw_fields
 from torchfovea.sim.model import Scene
 from torchfovea.sim.motor import InstantMotor
-from torchfovea.sim.rays import MISS_RANGE_M
 from torchfovea.sim.room import FLOOR, TARGET
-from torchfovea.sim.trace import occluded, solids_of, trace
+from torchfovea.sim.trace import occluded, ranges, solids_of, trace
 
 __all__ = ["GeometricArenas"]
 
@@ -80,7 +79,7 @@ class GeometricArenas:
         rotation, origin = cyclopean(self.observer.head, Gaze(*(angle.to(self.kind.device).double() for angle in gaze)))
         range_m, geom = trace(self.solids, origin, rotation[:, None, :, 2])
         point = origin + range_m * rotation[..., 2]
-        kind = torch.where(geom >= 0, self.kind.gather(1, geom.clamp(min=0)), -1)[:, 0]
+        kind = self.kind.gather(1, geom)[:, 0]
         return Fixation(point, point.square().sum(-1).sqrt(), kind == FLOOR, kind == TARGET)
 
     def look(self, gaze: Gaze, generators: Sequence[torch.Generator]) -> Look:
@@ -105,9 +104,7 @@ class GeometricArenas:
         scale = torch.rsqrt(x * x + y * y + z * z)
         unit = torch.stack([x * scale, y * scale, z * scale]).movedim(0, -1)
         direction = to_ego(pose.R_left, unit.expand(len(self.kind), -1, -1))
-        range_m, geom = trace(self.solids, pose.t_left, direction)
-        points = pose.t_left[:, None] + range_m[..., None] * direction
+        points = pose.t_left[:, None] + ranges(self.solids, pose.t_left, direction)[..., None] * direction
         line = points - pose.t_right[:, None]
         ahead = (line * pose.R_right[:, None, :, 2]).sum(-1) > 0
-        visible = (geom >= 0) & (range_m < MISS_RANGE_M) & ahead & ~occluded(self.solids, pose.t_right, points)
-        return points.to(left_rays.dtype), visible
+        return points.to(left_rays.dtype), ahead & ~occluded(self.solids, pose.t_right, points)

@@ -1,12 +1,13 @@
 """Rays through many scenes at once, as tensor operations on any device: the same surfaces that MuJoCo's rays meet.
 
-The scenes are made of a floor, upright boxes, upright cylinders and spheres. The room's walls are tried for every ray;
-the other solids only for the rays that pass near them, as one flat list of (ray, solid) pairs. `torchfovea.sim.rays` is
-the reference: with float64 the two agree to rounding.
+The scenes are closed rooms with upright boxes, upright cylinders and spheres in them. Every ray leaves the room through
+the floor, a wall or the ceiling; the other solids are tried only for the rays that pass near them, as one flat list of
+(ray, solid) pairs. `torchfovea.sim.rays` is the reference: with float64 the two agree to rounding.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -15,10 +16,9 @@ from torch import Tensor
 
 from torchfovea.setting import require
 from torchfovea.sim.model import Scene
-from torchfovea.sim.rays import MISS_RANGE_M
 from torchfovea.sim.room import FLOOR, ROOM, Solid
 
-__all__ = ["Solids", "occluded", "solids_of", "trace"]
+__all__ = ["Solids", "occluded", "ranges", "solids_of", "trace"]
 
 _TINY = 1e-300
 
@@ -43,20 +43,22 @@ class Solids(NamedTuple):
     """B scenes as tensors, in each scene's world.
 
     Attributes:
-        walls: axis-aligned boxes of the room, tried for every ray.
+        middle: of the room, (3, B, 1).
+        half: its half lengths, (3, B, 1).
+        faces: geoms that close it toward −x, x, −y, y, −z and z, (6, B).
         boxes: turned boxes.
         cylinders: upright.
         spheres: of any size.
-        floor: geom of the plane z = 0, (B,).
         rotation: yaw of E as cosine and sine, (2, B, 1).
         translation: of E, (3, B, 1).
     """
 
-    walls: _Group
+    middle: Tensor
+    half: Tensor
+    faces: Tensor
     boxes: _Group
     cylinders: _Group
     spheres: _Group
-    floor: Tensor
     rotation: Tensor
     translation: Tensor
 
@@ -67,23 +69,21 @@ def solids_of(
     """Scenes as tensors.
 
     Raises:
-        SettingError: for a scene without exactly one floor.
+        SettingError: for a scene that is not a room closed by one floor, four walls and a ceiling.
     """
-    chosen: dict[str, list[list[tuple[int, Solid]]]] = {"walls": [], "boxes": [], "cylinders": [], "spheres": []}
-    floors, yaw, place = [], [], []
+    chosen: dict[str, list[list[tuple[int, Solid]]]] = {"boxes": [], "cylinders": [], "spheres": []}
+    rooms, faces, yaw, place = [], [], [], []
     for scene in scenes:
         parts: dict[str, list[tuple[int, Solid]]] = {name: [] for name in chosen}
-        planes = []
+        shell = []
         for geom, solid in enumerate(scene.solids):
-            if solid.shape == "plane":
-                planes.append(geom)
-            elif solid.shape == "box":
-                parts["walls" if solid.kind == ROOM and solid.yaw_rad == 0 else "boxes"].append((geom, solid))
+            if solid.kind in (FLOOR, ROOM):
+                shell.append((geom, solid))
             else:
-                parts[f"{solid.shape}s"].append((geom, solid))
-        one = len(planes) == 1 and scene.solids[planes[0]].kind == FLOOR
-        require(one, "scene", f"{len(planes)} planes", "one floor")
-        floors.append(planes[0])
+                parts["boxes" if solid.shape == "box" else f"{solid.shape}s"].append((geom, solid))
+        ends, geoms = _closed(shell)
+        rooms.append(ends)
+        faces.append(geoms)
         rotation, translation = scene.world_from_ego
         yaw.append((float(rotation[0, 0]), float(rotation[1, 0])))
         place.append(tuple(float(t) for t in translation))
@@ -93,16 +93,31 @@ def solids_of(
     def tensor(values: object) -> Tensor:
         return torch.tensor(values, dtype=dtype, device=device)
 
-    walls, boxes, cylinders, spheres = (_group(found, tensor) for found in chosen.values())
+    low, high = tensor(rooms).permute(2, 1, 0).contiguous()
     return Solids(
-        walls,
-        boxes,
-        cylinders,
-        spheres,
-        torch.tensor(floors, device=device),
-        tensor(yaw).T[..., None].contiguous(),
-        tensor(place).T[..., None].contiguous(),
+        ((low + high) / 2)[..., None],
+        ((high - low) / 2)[..., None],
+        torch.tensor(faces, device=device).T.contiguous(),
+        boxes=_group(chosen["boxes"], tensor),
+        cylinders=_group(chosen["cylinders"], tensor),
+        spheres=_group(chosen["spheres"], tensor),
+        rotation=tensor(yaw).T[..., None].contiguous(),
+        translation=tensor(place).T[..., None].contiguous(),
     )
+
+
+def _closed(shell: list[tuple[int, Solid]]) -> tuple[list[list[float]], list[int]]:
+    """Where the room ends toward −x and x, −y and y, −z and z, and the geoms there, in that order."""
+    ends, faces = [[-math.inf, math.inf] for _ in range(3)], [-1] * 6
+    for geom, solid in shell:
+        axis = 2 if solid.shape == "plane" else min(range(3), key=lambda k: solid.size_m[k])
+        side = 0 if solid.shape == "plane" else int(solid.position_m[axis] > 0)
+        thick = 0.0 if solid.shape == "plane" else solid.size_m[axis]
+        require(faces[2 * axis + side] < 0 and solid.yaw_rad == 0, "scene", solid.name, "one wall on each side")
+        ends[axis][side] = solid.position_m[axis] + (thick, -thick)[side]
+        faces[2 * axis + side] = geom
+    require(min(faces) >= 0, "scene", f"{len(shell)} parts of a room", "a floor, four walls and a ceiling")
+    return ends, faces
 
 
 def _group(scenes: list[list[tuple[int, Solid]]], tensor: Callable[[object], Tensor]) -> _Group:
@@ -156,21 +171,19 @@ def _slab(middle: Tensor, half: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor
     return centre - reach, centre + reach
 
 
-def _near(group: _Group, rays: _Rays, upright: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """The pairs of rays and solids worth an exact test: batch, flat solid and flat ray numbers, (P,) each."""
-    rx, ry, rz = (c[..., 0] - o for c, o in zip(group.centre, rays.origin, strict=True))  # (B, K)
-    dx, dy, dz = rays.direction
-    if upright:  # seen from above, the ray's line passes the axis within the radius
-        level = torch.rsqrt((dx * dx + dy * dy).clamp(min=_TINY))
-        aside = torch.stack([ry, -rx], -1) @ torch.stack([dx * level, dy * level], -2)
-        mask = aside.abs_() <= group.size[0] * (1 + 1e-9)
-    else:  # it passes the bounding sphere's centre within its radius, ahead
-        radius2 = group.size.square().sum(0)[..., 0]
-        beside2 = rx * rx + ry * ry + rz * rz - radius2 * (1 + 1e-9)
-        least = torch.where(beside2 > 0, beside2.clamp(min=0).sqrt(), -torch.inf)
-        mask = torch.stack([rx, ry, rz], -1) @ torch.stack([dx, dy, dz], -2) >= least[..., None]
+def _near(group: _Group, rays: _Rays, unit: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The pairs of rays and solids worth an exact test: batch, flat solid and flat ray numbers, (P,) each.
+
+    Near is a ray that passes a solid's bounding sphere, ahead. Single precision, with a margin, is enough for that.
+    """
+    x, y, z = (c[..., 0] - o for c, o in zip(group.centre, rays.origin, strict=True))  # (B, K)
+    square = x * x + y * y + z * z
+    beside2 = square - group.size.square().sum(0)[..., 0]
+    # the cosine's numerator that the sphere's rim has, less what rounding to float32 may take
+    least = torch.where(beside2 > 0, beside2.clamp(min=0).sqrt(), -torch.inf) - 1e-5 * (1 + square.sqrt())
+    mask = torch.stack([x, y, z], -1).float() @ unit >= least.float()[..., None]
     flat = mask.reshape(-1).nonzero()[:, 0]
-    n = dx.shape[1]
+    n = unit.shape[-1]
     which = flat // n
     batch = which // group.geom.shape[1]
     return batch, which, flat + (batch - which) * n
@@ -178,10 +191,11 @@ def _near(group: _Group, rays: _Rays, upright: bool) -> tuple[Tensor, Tensor, Te
 
 def _pairs(solids: Solids, rays: _Rays) -> list[_Pairs]:
     found = []
+    unit = torch.stack([d.float() for d in rays.direction], -2)
     for group, kind in ((solids.boxes, "box"), (solids.cylinders, "cylinder"), (solids.spheres, "sphere")):
         if group.geom.shape[1] == 0:
             continue
-        b, which, flat = _near(group, rays, kind == "cylinder")
+        b, which, flat = _near(group, rays, unit)
         dx, dy, dz = (d.reshape(-1).index_select(0, flat) for d in rays.direction)
         cx, cy, cz, sx, sy, sz, c, s = (
             part.reshape(-1).index_select(0, which) for part in (*group.centre, *group.size, *group.turn)
@@ -196,8 +210,9 @@ def _pairs(solids: Solids, rays: _Rays) -> list[_Pairs]:
         elif kind == "cylinder":
             a = (dx * dx + dy * dy).clamp(min=_TINY)
             middle, cross = (dx * rx + dy * ry) / a, dx * ry - dy * rx
-            half = (sx * sx * a - cross * cross).clamp(min=0).sqrt() / a
-            ends = [(middle - half, middle + half), _slab(rz, sy, _inverse(dz))]
+            inside = sx * sx * a - cross * cross
+            half = inside.clamp(min=0).sqrt() / a
+            ends = [(torch.where(inside >= 0, middle - half, torch.inf), middle + half), _slab(rz, sy, _inverse(dz))]
         else:
             along = dx * rx + dy * ry + dz * rz
             inside = sx * sx - (rx * rx + ry * ry + rz * rz) + along * along
@@ -217,7 +232,7 @@ def _first(entry: Tensor, leave: Tensor) -> Tensor:
 
 
 def trace(solids: Solids, origin_e: Tensor, directions_e: Tensor) -> tuple[Tensor, Tensor]:
-    """First surfaces on rays.
+    """First surfaces on rays from inside the room.
 
     Args:
         solids: B scenes.
@@ -225,34 +240,40 @@ def trace(solids: Solids, origin_e: Tensor, directions_e: Tensor) -> tuple[Tenso
         directions_e: unit, (B, N, 3) in E.
 
     Returns:
-        Ranges (B, N) [m], MISS_RANGE_M where nothing is met, and geoms (B, N), -1 there; in the solids' dtype.
+        Ranges (B, N) [m] and geoms (B, N); in the solids' dtype.
+
+    Raises:
+        SettingError: for an origin outside of its room.
     """
+    range_m, leave, rays, met = _ranges(solids, origin_e, directions_e)
+    # by which face the room is left
+    geom = torch.zeros_like(range_m, dtype=torch.int64)
+    for axis, (face, ahead) in enumerate(zip(solids.faces.view(3, 2, -1, 1), rays.direction, strict=True)):
+        geom = torch.where(leave[axis] <= range_m, torch.where(ahead > 0, face[1], face[0]), geom)
+    geom = geom.reshape(-1)
+    for pairs in met:
+        first = _first(pairs.entry, pairs.exit) == range_m.reshape(-1).index_select(0, pairs.ray)
+        geom[pairs.ray[first]] = pairs.geom[first]
+    return range_m, geom.reshape(range_m.shape)
+
+
+def ranges(solids: Solids, origin_e: Tensor, directions_e: Tensor) -> Tensor:
+    """The ranges of `trace` alone."""
+    return _ranges(solids, origin_e, directions_e)[0]
+
+
+def _ranges(solids: Solids, origin_e: Tensor, directions_e: Tensor) -> tuple[Tensor, list[Tensor], _Rays, list[_Pairs]]:
+    """Ranges (B, N), where each pair of faces is left, and what led there."""
     rays = _world(solids, origin_e, directions_e)
-    (ox, oy, oz), (dx, _, dz) = rays
-    down = torch.where(dz < -_TINY, -oz / torch.where(dz < -_TINY, dz, -1), torch.inf)
-    best = torch.where(down > 0, down, torch.inf)
-    geom = solids.floor[:, None].expand(best.shape)
-    walls, (ix, iy, iz) = solids.walls, (_inverse(d) for d in rays.direction)
-    for k in range(walls.geom.shape[1]):
-        (cx, cy, cz), (sx, sy, sz) = walls.centre[:, :, k], walls.size[:, :, k]
-        (lx, hx), (ly, hy), (lz, hz) = (_slab(cx - ox, sx, ix), _slab(cy - oy, sy, iy), _slab(cz - oz, sz, iz))
-        range_m = torch.maximum(torch.maximum(lx, ly), lz)
-        # from outside the wall
-        nearer = (range_m <= torch.minimum(torch.minimum(hx, hy), hz)) & (range_m > 0) & (range_m < best)
-        best = torch.where(nearer, range_m, best)
-        geom = torch.where(nearer, walls.geom[:, k, None], geom)
-    best, geom = best.reshape(-1), geom.reshape(-1).clone()
+    offset = [middle - o for middle, o in zip(solids.middle, rays.origin, strict=True)]
+    inside = bool(torch.stack([h - o.abs() for h, o in zip(solids.half, offset, strict=True)]).amin() > 0)
+    require(inside, "origin", "an eye outside of the room", "eyes inside")
+    leave = [_slab(o, h, _inverse(d))[1] for o, h, d in zip(offset, solids.half, rays.direction, strict=True)]
+    best = torch.minimum(torch.minimum(leave[0], leave[1]), leave[2])
     met = _pairs(solids, rays)
-    if met:
-        ray, which, entry, leave = (torch.cat(parts) for parts in zip(*met, strict=True))
-        range_m = _first(entry, leave)
-        best = best.scatter_reduce(0, ray, range_m, "amin")
-        first = (range_m == best.index_select(0, ray)) & (range_m < torch.inf)
-        geom[ray[first]] = which[first]
-    missed = torch.isinf(best)
-    shape = dx.shape
-    range_m = torch.where(missed, torch.full_like(best, MISS_RANGE_M), best).reshape(shape)
-    return range_m, torch.where(missed, -1, geom).reshape(shape)
+    for pairs in met:
+        best.view(-1).scatter_reduce_(0, pairs.ray, _first(pairs.entry, pairs.exit), "amin")
+    return best, leave, rays, met
 
 
 def occluded(solids: Solids, origin_e: Tensor, points_e: Tensor) -> Tensor:
