@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,26 +15,24 @@ from torchfovea.files import write_figure
 from torchfovea.tuning.bias import log_density_each, log_normalizer_each, reachable
 from torchfovea.tuning.problem import Problem
 from torchfovea.tuning.scenes import Scenes, draw_scenes, stream
+from torchfovea.tuning.study import Row, mean_curves, student
 from torchfovea.tuning.train import State
 
 matplotlib.use("Agg")
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-__all__ = ["draw_curves", "draw_gradient", "draw_tuning"]
-
-# two-sided 95% quantiles of Student's t by degrees of freedom, for bands over few seeds
-_STUDENT = {1: 12.71, 2: 4.30, 3: 3.18, 4: 2.78, 5: 2.57, 6: 2.45, 7: 2.36, 8: 2.31, 9: 2.26}
+__all__ = ["draw_curves", "draw_gradients", "draw_tuning"]
 
 
 def draw_tuning(
-    folder: Path, problem: Problem, start: Tensor, state: State, check: dict[str, Any] | None, rows: Sequence[Any]
+    folder: Path, problem: Problem, start: Tensor, state: State, checks: Sequence[dict[str, Any]], rows: Sequence[Row]
 ) -> None:
-    """Draw bias.png and learning.png, and where there is something to draw, gradient.png and curves.png."""
+    """Draw bias.png and learning.png, and where there is something to draw, gradients.png and curves.png."""
     _draw_bias(folder / "bias.png", problem, start, state)
     _draw_learning(folder / "learning.png", state)
-    if check is not None:
-        draw_gradient(folder / "gradient.png", check)
+    if checks:
+        draw_gradients(folder / "gradients.png", checks)
     if rows:
         draw_curves(folder / "curves.png", rows)
 
@@ -102,39 +98,35 @@ def _draw_learning(path: Path, state: State) -> None:
     write_figure(path, figure, dpi=130)
 
 
-def draw_gradient(path: Path, check: dict[str, Any]) -> None:
-    """Each number's derivative: the estimate beside central differences."""
-    estimate, difference = np.array(check["estimate"]), np.array(check["difference"])
-    figure = Figure(figsize=(max(6.4, 0.25 * len(estimate)), 3.6), layout="constrained")
-    ax = figure.subplots()
-    place = np.arange(len(estimate))
-    ax.bar(place - 0.2, difference, 0.4, color="0.6", label="central differences")
-    ax.bar(place + 0.2, estimate, 0.4, color="tab:blue", label="estimator")
-    ax.axhline(0, color="0.2", lw=0.6)
-    ax.set(xlabel="number", ylabel="derivative of the objective")
-    ax.set_title(f"cosine {check['cosine']:.3f}, norm ratio {check['norm_ratio']:.3f}")
-    ax.legend(frameon=False)
+def draw_gradients(path: Path, checks: Sequence[dict[str, Any]]) -> None:
+    """Each number's derivative, point by point: central differences beside the estimates."""
+    points = list(dict.fromkeys(check["point"] for check in checks))
+    size = len(checks[0]["difference"])
+    figure = Figure(figsize=(max(7.6, 0.35 * size), 2.6 * len(points)), layout="constrained")
+    for ax, point in zip(np.atleast_1d(figure.subplots(len(points), 1, sharex=True)), points, strict=True):
+        here = [check for check in checks if check["point"] == point]
+        bars = [("central differences", "0.6", here[0]["difference"])]
+        for k, check in enumerate(here):
+            bars.append((f"{check['estimator']}, cosine {check['cosine']:.2f}", f"C{k}", check["estimate"]))
+        width = 0.8 / len(bars)
+        for k, (label, colour, values) in enumerate(bars):
+            ax.bar(np.arange(size) + (k - (len(bars) - 1) / 2) * width, values, width, color=colour, label=label)
+        ax.axhline(0, color="0.2", lw=0.6)
+        ax.set(title=f"at {point}", ylabel="derivative")
+        ax.legend(frameon=False, fontsize="x-small", ncols=2)
+    ax.set_xlabel("number of the vector")
     write_figure(path, figure, dpi=130)
 
 
-def draw_curves(path: Path, rows: Sequence[Any]) -> None:
+def draw_curves(path: Path, rows: Sequence[Row]) -> None:
     """Held-out score over episodes for each method: mean over seeds with its 95% interval (Student's t)."""
-    scores: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for method, _, episodes, _, heldout in rows:
-        scores[method][int(episodes)].append(float(heldout))
     figure = Figure(figsize=(7.6, 5), layout="constrained")
     ax = figure.subplots()
-    for k, (method, by_budget) in enumerate(scores.items()):
-        budgets = sorted(by_budget)
-        mean = np.array([np.mean(by_budget[b]) for b in budgets])
-        half = []
-        for b in budgets:
-            n = len(by_budget[b])
-            t = _STUDENT.get(n - 1, 1.96)
-            half.append(t * np.std(by_budget[b], ddof=1) / math.sqrt(n) if n > 1 else 0.0)
-        colour = f"C{k % 10}"
+    for k, (method, by_budget) in enumerate(mean_curves(rows).items()):
+        mean, low, high = np.array([student(values) for values in by_budget.values()]).T
+        budgets, colour = list(by_budget), f"C{k % 10}"
         ax.plot(budgets, mean, "o-", ms=3.5, color=colour, label=method.replace("_", " "))
-        ax.fill_between(budgets, mean - half, mean + half, color=colour, alpha=0.15, lw=0)
+        ax.fill_between(budgets, low, high, color=colour, alpha=0.15, lw=0)
     ax.set(xscale="log", xlabel="simulated episodes, counterfactual runs included", ylabel="held-out gap per saccade")
     ax.legend(frameon=False, ncols=2)
     write_figure(path, figure, dpi=130)

@@ -16,26 +16,28 @@ from torch import Tensor
 
 from torchfovea.config import run_folder
 from torchfovea.experiments.build import build_observer, construct, number, whole
+from torchfovea.experiments.manifest import finished
+from torchfovea.experiments.tune_study import check_study, study_curves, study_gradients
 from torchfovea.files import replacing, write_csv, write_result
 from torchfovea.setting import require
 from torchfovea.significance import bootstrap_interval
 from torchfovea.sphere import direction_mixture, sphere_quadrature
-from torchfovea.tuning.baselines import SEARCHES, TABLE_1, hand, table_1
+from torchfovea.tuning.baselines import TABLE_1, hand, table_1
 from torchfovea.tuning.bias import Shape, decode, encode, mixture_of, reachable
 from torchfovea.tuning.prior_field import fit_by_gradient, fit_closed_form
 from torchfovea.tuning.problem import Problem, evaluate
 from torchfovea.tuning.scenes import Distribution, draw_scenes, stream
 from torchfovea.tuning.simulator import Task
-from torchfovea.tuning.study import curves, finite_difference_check
-from torchfovea.tuning.train import ESTIMATORS, Schedule, State, train
+from torchfovea.tuning.study import Heldout, Row
+from torchfovea.tuning.train import Schedule, State, train
 
 __all__ = ["build_problem", "build_start", "memory_yaml", "run"]
 
 # what is null in the configuration
 PROFILES = {
-    "quick": {"episodes": 512, "validation_scenes": 128, "heldout_scenes": 256, "check_episodes": 0},
-    "full": {"episodes": 2048, "validation_scenes": 256, "heldout_scenes": 1024, "check_episodes": 1024},
-    "paper": {"episodes": 8192, "validation_scenes": 512, "heldout_scenes": 4096, "check_episodes": 8192},
+    "quick": {"episodes": 512, "validation_scenes": 128, "heldout_scenes": 256, "check_episodes": 256},
+    "full": {"episodes": 2048, "validation_scenes": 256, "heldout_scenes": 1024, "check_episodes": 4096},
+    "paper": {"episodes": 8192, "validation_scenes": 512, "heldout_scenes": 4096, "check_episodes": 16384},
 }
 _FIELD_SCENES = 512
 _FIELD_DIRECTIONS = 4000  # on the whole sphere
@@ -104,7 +106,8 @@ def run(cfg: DictConfig) -> float:
 
 def _run(cfg: DictConfig) -> float:
     profile = PROFILES[str(HydraConfig.get().runtime.choices["profile"])]
-    sizes = {name: value if cfg[name] is None else whole(cfg, name, 0) for name, value in profile.items()}
+    sizes = {name: value if cfg[name] is None else whole(cfg, name) for name, value in profile.items()}
+    check_study(cfg)
     problem = build_problem(cfg)
     start, folder = build_start(cfg, problem.shape), run_folder()
     settings = OmegaConf.to_container(cfg, resolve=True)
@@ -114,6 +117,10 @@ def _run(cfg: DictConfig) -> float:
     checkpoint = folder / "checkpoint.pt"
     if cfg.resume is not None:
         require(Path(cfg.resume).is_file(), "resume", cfg.resume, "a checkpoint.pt that exists")
+    before = finished(cfg, folder, "heldout.tuned.gap_per_saccade")
+    if before is not None:
+        return before
+    if cfg.resume is not None and not checkpoint.exists():
         shutil.copyfile(cfg.resume, checkpoint)
     bars = (
         TextColumn("{task.description}"),
@@ -138,16 +145,17 @@ def _run(cfg: DictConfig) -> float:
         "parameters": problem.shape.size,
     }
     _write_memory(problem, state, folder)
-    table, best = _judge(cfg, problem, start, state, sizes["heldout_scenes"], figures)
-    check = None
-    if sizes["check_episodes"] > 0:
-        check = finite_difference_check(problem, start, schedule.estimator, sizes["check_episodes"])
-    figures["gradient_cosine"] = check["cosine"] if check else None
-    figures["gradient_norm_ratio"] = check["norm_ratio"] if check else None
-    rows = _study(cfg, problem, start, schedule, sizes["heldout_scenes"], folder) if cfg.study else []
+    heldout = Heldout(sizes["heldout_scenes"], whole(cfg, "heldout_seed", 0))
+    table, best = _judge(cfg, problem, start, state, heldout, figures)
+    rows: list[Row] = []
+    checks: list[dict[str, Any]] = []
+    if cfg.study == "curves":
+        rows = study_curves(cfg, problem, start, schedule, heldout, folder, figures)
+    if cfg.study == "gradients":
+        checks = study_gradients(cfg, problem, start, state, sizes["check_episodes"], folder)
     from torchfovea.pictures_tuning import draw_tuning
 
-    draw_tuning(folder, problem, start, state, check, rows)
+    draw_tuning(folder, problem, start, state, checks, rows)
     write_csv(folder / "tuning.csv", ("episodes", "validation"), [(e, v) for e, v, _ in state.history])
     write_result(folder, figures)
     Console().print(table)
@@ -170,10 +178,10 @@ def _write_memory(problem: Problem, state: State, folder: Path) -> None:
 
 
 def _judge(
-    cfg: DictConfig, problem: Problem, start: Tensor, state: State, scenes: int, figures: dict[str, Any]
+    cfg: DictConfig, problem: Problem, start: Tensor, state: State, heldout: Heldout, figures: dict[str, Any]
 ) -> tuple[Table, float]:
-    """Every policy on the held-out scenes."""
-    alpha, checked = float(cfg.acquisition.alpha), min(scenes, 512)
+    """Every policy on the held-out scenes, and how far the tuned one is ahead of others, paired over scenes."""
+    alpha, checked = float(cfg.acquisition.alpha), min(heldout.scenes, 512)
     policies = {name: (table_1(problem.shape, name, alpha), problem) for name in TABLE_1}
     policies["start"] = (start, problem)
     policies["hand"] = (hand(problem, alpha, checked)[0], problem)
@@ -192,36 +200,19 @@ def _judge(
             if name == "prior_field":
                 policies["tuned_with_prior_field"] = (state.best, informed)
     table = Table("policy", "gap per saccade", "95% CI", box=None, padding=(0, 2, 0, 0))
-    best = 0.0
-    for name, (vector, judged) in policies.items():
-        values = evaluate(judged, vector, scenes, stream("heldout", 0))
-        interval = bootstrap_interval(values, torch.Generator().manual_seed(0), resamples=2000)
+    values = {}
+
+    def note(name: str, sample: Tensor) -> float:
+        interval = bootstrap_interval(sample, torch.Generator().manual_seed(0), resamples=2000)
         for key, value in zip(("gap_per_saccade", "ci_low", "ci_high"), interval, strict=True):
             figures[f"heldout.{name}.{key}"] = float(value)
         table.add_row(name, f"{interval.estimate:.4f}", f"{interval.low:.4f} to {interval.high:.4f}")
-        best = float(interval.estimate) if name == "tuned" else best
-    return table, best
+        return float(interval.estimate)
 
-
-def _study(
-    cfg: DictConfig, problem: Problem, start: Tensor, schedule: Schedule, scenes: int, folder: Path
-) -> list[Any]:
-    """Learning curves of the methods asked for."""
-    methods = [str(method) for method in cfg.methods]
-    for method in methods:
-        known = method in SEARCHES or method.partition("+")[0] in ESTIMATORS
-        require(known, "methods", method, "any of " + ", ".join([*ESTIMATORS, *SEARCHES]))
-    seeds = whole(cfg, "seeds")
-    rows = []
-    with Progress(
-        TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=Console(stderr=True), transient=True
-    ) as bar:
-        job = bar.add_task("study", total=len(methods) * seeds)
-
-        def show(method: str, seed: int) -> None:
-            bar.update(job, advance=1, description=f"study  {method}, seed {seed + 1} of {seeds}")
-
-        for row in curves(problem, start, methods, seeds, schedule, scenes, show):
-            rows.append(row)
-            write_csv(folder / "curves.csv", ("method", "seed", "episodes", "validation", "heldout"), rows)
-    return rows
+    for name, (vector, judged) in policies.items():
+        values[name] = evaluate(judged, vector, heldout.scenes, stream("heldout", heldout.seed))
+        note(name, values[name])
+    best = max(TABLE_1, key=lambda name: float(values[name].mean()))
+    for other in (best, "hand", *(["prior_field"] if cfg.prior_field else [])):
+        note(f"tuned minus {other}", values["tuned"] - values[other])
+    return table, float(values["tuned"].mean())
