@@ -25,6 +25,7 @@ from torchfovea.tuning.bias import (
     draw_cells,
     encode,
     fix_vector,
+    fov_of,
     log_density_each,
     log_normalizer_each,
     mixture_of,
@@ -38,7 +39,7 @@ from torchfovea.tuning.problem import Problem, evaluate, play, prepare
 from torchfovea.tuning.scenes import Distribution, cast, draw_scenes, stream
 from torchfovea.tuning.simulator import Task, simulate
 from torchfovea.tuning.study import Heldout, budgets_up_to, curves, episodes_to_reach, student
-from torchfovea.tuning.train import ESTIMATORS, Schedule, train
+from torchfovea.tuning.train import ESTIMATORS, Schedule, gradient, train
 
 HEAD = Head()
 MEAN = [0.8, 0.4, -0.2]
@@ -194,6 +195,27 @@ def test_agreement_sees_through_noise():
     assert found["snr_32_episodes"] == pytest.approx(6 / 40, rel=0.2)
     alone = agreement(noisy(1.2, 4000), noisy(1.0, 4000))
     assert alone["norm"] == pytest.approx(5, abs=3 * alone["norm_error"]) and alone["cosine"] > 0.9
+
+
+@pytest.mark.parametrize("alpha", [True, False])
+def test_the_field_of_view_is_tuned_by_common_random_numbers(alpha):
+    p = problem(cells=30, saccades=5, fov_deg=50.0, tune_alpha=alpha)
+    x = vector(p.shape)
+    assert len(x) == p.shape.size == 10 + alpha and fov_of(p.shape, x) == pytest.approx(50)
+    torch.testing.assert_close(fix_vector(p.shape, fix_vector(p.shape, x)), fix_vector(p.shape, x))
+    wide = x.clone()
+    wide[-1] = 9.0
+    assert fov_of(p.shape, fix_vector(p.shape, wide)) == pytest.approx(150)
+    wide[-1] = math.log(math.tan(math.radians(50)))
+    plain = Problem(
+        Task(Observer(camera=Pinhole.from_fov(100.0, 100.0)), 5), p.distribution, Shape(tune_alpha=alpha), 30
+    )
+    batch = p.batch(64, stream("training", 0))
+    assert torch.equal(play(p, wide, batch).value, play(plain, wide[:-1], batch).value)
+    found = gradient(p, "coverage", x, batch, 0.5)
+    assert found.vector[-1] > 0 and found.episodes == 64 + 64 * (1 + alpha)
+    best = train(p, x, Schedule(160, scenes=4, warm_episodes=0, validations=2, validation_scenes=32)).vector
+    assert fov_of(p.shape, best) > 60
 
 
 @pytest.mark.parametrize("name", list(ESTIMATORS))
@@ -392,6 +414,11 @@ def test_the_command_keeps_its_contract(tmp_path, capsys):
     memory.cells = 30
     cells = build_cells(OmegaConf.create({"memory": memory}), HEAD, torch.Generator().manual_seed(0))
     assert cells.shape == (30, 3) and reachable(HEAD, cells).all()
+    # the full simulator takes both
+    tuned = ["memory=tuned", "scene=left_below", "scene.cans=3", "fidelity=geometric", "memory.cells=50"]
+    tuned += ["sensor.receptive_fields=500", "sensor.fov_deg=90", "episodes=1", "saccades=2", "picture=false"]
+    assert main(["search", "--config-dir", str(folder), *tuned, f"hydra.run.dir={tmp_path}/search"]) == 0
+    assert (tmp_path / "search" / "result.json").exists()
 
 
 def test_the_gradients_study(tmp_path):
@@ -408,6 +435,7 @@ def test_the_commands_mistakes_are_one_line(tmp_path, capsys):
     for settings, words in (
         (["resume=nowhere.pt"], "resume = nowhere.pt"),
         (["estimator=magic"], "estimator = magic"),
+        (["tune_fov=true", "sensor.fov_deg=170"], "sensor.fov_deg = 170"),
         (["memory=geodesic"], "memory = geodesic"),
         (["distribution.regions=[[100,120,0,10]]"], "distribution.regions"),
         (["study=true"], "study = True"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from torchfovea.setting import require
 from torchfovea.significance import bootstrap_interval
 from torchfovea.sphere import direction_mixture, sphere_quadrature
 from torchfovea.tuning.baselines import TABLE_1, hand, table_1
-from torchfovea.tuning.bias import Shape, decode, encode, mixture_of, reachable
+from torchfovea.tuning.bias import Shape, decode, encode, fov_of, mixture_of, reachable
 from torchfovea.tuning.prior_field import fit_by_gradient, fit_closed_form
 from torchfovea.tuning.problem import Problem, evaluate
 from torchfovea.tuning.scenes import Distribution, draw_scenes, stream
@@ -31,7 +32,7 @@ from torchfovea.tuning.simulator import Task
 from torchfovea.tuning.study import Heldout, Row
 from torchfovea.tuning.train import Schedule, State, train
 
-__all__ = ["build_problem", "build_start", "memory_yaml", "run"]
+__all__ = ["build_problem", "build_start", "memory_yaml", "run", "scene_yaml"]
 
 # what is null in the configuration
 PROFILES = {
@@ -66,7 +67,8 @@ def build_problem(cfg: DictConfig) -> Problem:
     task = Task(build_observer(cfg), whole(cfg, "saccades", 2), number(cfg, "far_m"), str(cfg.metric))
     alpha = OmegaConf.select(cfg, "acquisition.alpha")
     require(cfg.acquisition.name == "ucb", "acquisition", cfg.acquisition.name, "ucb, whose alpha is tuned")
-    shape = Shape(whole(cfg, "components"), distribution.conditioned, bool(cfg.tune_alpha), float(alpha))
+    fov_deg = float(cfg.sensor.fov_deg) if cfg.tune_fov else None
+    shape = Shape(whole(cfg, "components"), distribution.conditioned, bool(cfg.tune_alpha), float(alpha), fov_deg)
     return Problem(task, distribution, shape, whole(cfg, "memory.cells", 2))
 
 
@@ -144,6 +146,8 @@ def _run(cfg: DictConfig) -> float:
         "runs_begun": state.runs,
         "parameters": problem.shape.size,
     }
+    if problem.shape.fov_deg is not None:
+        figures["fov_deg"] = fov_of(problem.shape, state.best)
     _write_memory(problem, state, folder)
     heldout = Heldout(sizes["heldout_scenes"], whole(cfg, "heldout_seed", 0))
     table, best = _judge(cfg, problem, start, state, heldout, figures)
@@ -163,18 +167,42 @@ def _run(cfg: DictConfig) -> float:
 
 
 def _write_memory(problem: Problem, state: State, folder: Path) -> None:
-    """The result as files for `search --config-dir FOLDER memory=tuned`; a conditioned one for nine tasks."""
+    """The result as files for `search --config-dir FOLDER memory=tuned scene=...`; a conditioned one for nine tasks."""
     alpha = float(decode(problem.shape, state.best, torch.zeros(1, 2, dtype=torch.float64)).alpha)
-    use = f"torchfovea search --config-dir THIS_RUNS_FOLDER memory=NAME acquisition.alpha={alpha:.4g}"
-    tasks: dict[str, Tensor | None] = {"tuned": None}
+    own, observer = problem.distribution, problem.at(state.best).task.observer
+    fov_deg = 2 * math.degrees(math.atan(observer.retina.radius_px / observer.camera.focal_px))
+    tasks: dict[str, Tensor | None] = {"": None}
+    regions = {f"_{k}" if len(own.regions) > 1 else "": region for k, region in enumerate(own.regions)}
     if problem.shape.conditioned:
         corners = [(a, e) for a in (-1.0, 0.0, 1.0) for e in (-1.0, 0.0, 1.0)]
-        tasks = {f"tuned_task_{a:+.0f}_{e:+.0f}": torch.tensor([a, e]) for a, e in corners}
+        tasks = {f"_task_{a:+.0f}_{e:+.0f}": torch.tensor([a, e]) for a, e in corners}
+        regions = {f"_task_{a:+.0f}_{e:+.0f}": own.region_of(a, e) for a, e in corners}
     for name, task in tasks.items():
-        note = f"Tuned on {problem.distribution.name}; {use.replace('NAME', name)}"
-        text = memory_yaml(problem, state.best, task, note)
-        with replacing(folder / "memory" / f"{name}.yaml") as temporary:
+        use = f"search --config-dir THIS_RUNS_FOLDER memory=tuned{name} scene={own.name}"
+        settings = f"acquisition.alpha={alpha:.4g} sensor.fov_deg={fov_deg:.4g}"
+        text = memory_yaml(problem, state.best, task, f"Tuned on {own.name}: torchfovea {use} {settings}")
+        with replacing(folder / "memory" / f"tuned{name}.yaml") as temporary:
             temporary.write_text(text, encoding="utf-8")
+    for name, region in regions.items():
+        with replacing(folder / "scene" / f"{own.name}{name}.yaml") as temporary:
+            temporary.write_text(scene_yaml(own, region), encoding="utf-8")
+
+
+def scene_yaml(distribution: Distribution, region: tuple[float, float, float, float]) -> str:
+    """A distribution's scenes with the target in one region, in the form of conf/scene/cans.yaml.
+
+    The cans then stand on poles, amid furniture.
+    """
+    d = distribution
+    fields = ("cans", "target_range_m", "azimuth_deg", "elevation_deg", "range_m", "can_radius_m", "can_height_m",
+              "margin_m", "tries")  # fmt: skip
+    same = {name: getattr(d, name) for name in fields}
+    content = {"name": "cans", "target_azimuth_deg": region[:2], "target_elevation_deg": region[2:], **same}
+    walls = {name: getattr(d, name) for name in ("front_m", "back_m", "side_m", "height_m")}
+    content |= {"pole_radius_m": 0.012, "reach_margin_deg": 1.5, "room": {**walls, "furniture": True}}
+    content |= {"outside_first_view": False, "first_view_deg": 90.0}
+    plain = {name: list(value) if isinstance(value, tuple) else value for name, value in content.items()}
+    return f"# The scenes of distribution={d.name}, for search scene=...\n" + OmegaConf.to_yaml(OmegaConf.create(plain))
 
 
 def _judge(

@@ -88,8 +88,7 @@ def _conditioned_hand(shape: Shape, distribution: Distribution, sigma: float, al
     m = shape.components
     body[:, : 3 * m] = coefficients.repeat(1, m)
     body[0, 3 * m : 6 * m] = math.log(sigma)
-    tail = [torch.tensor([math.log(alpha)], dtype=torch.float64)] if shape.tune_alpha else []
-    return torch.cat([body.flatten(), *tail])
+    return torch.cat([body.flatten(), shape.tail(alpha, shape.fov_deg)])
 
 
 def _objective(problem: Problem, seed: int, per_evaluation: int) -> Callable[[Tensor, int], float]:
@@ -112,6 +111,8 @@ def _ranges(problem: Problem, start: Tensor) -> tuple[Tensor, Tensor]:
         low, high = torch.cat((low, -narrow)), torch.cat((high, narrow))
     if shape.tune_alpha:
         low, high = torch.cat((low, torch.tensor([-2.0]))), torch.cat((high, torch.tensor([1.0])))
+    if shape.fov_deg is not None:
+        low, high = torch.cat((low, torch.tensor([-1.0]))), torch.cat((high, torch.tensor([1.3])))
     return low.double(), high.double()
 
 

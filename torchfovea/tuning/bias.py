@@ -14,7 +14,7 @@ from torchfovea.setting import require
 from torchfovea.sphere import DirectionMixture, Quadrature, deep_tail, fix_gauge, log_radial_moment
 
 __all__ = [
-    "Bias", "Shape", "decode", "draw_cells", "encode", "features", "fix_vector", "log_density_each",
+    "Bias", "Shape", "decode", "draw_cells", "encode", "features", "fix_vector", "fov_of", "log_density_each",
     "log_normalizer_each", "mixture_of", "reachable",
 ]  # fmt: skip
 
@@ -22,6 +22,7 @@ REACH_RANGE_M = 1.0  # as in `torchfovea.experiments.build`: a direction is reac
 _LOG_DIAGONAL = (-3.0, 1.0)
 _LOG_ALPHA = (-4.0, 4.0)
 _MEAN = 4.0
+_FOV_DEG = (40.0, 150.0)
 _BLOCK = 8
 _FEWEST_ACCEPTED = 1e-3
 
@@ -36,17 +37,22 @@ class Shape:
             polynomial of the task with six coefficients.
         tune_alpha: whether log α is the last number of the vector; else α is `alpha`.
         alpha: of a vector without it.
+        fov_deg: where the sensor's field of view starts if log tan(fov/2) is a number of the vector, after log α; None:
+            it is not tuned.
     """
 
     components: int = 1
     conditioned: bool = False
     tune_alpha: bool = True
     alpha: float = 1.0
+    fov_deg: float | None = None
 
     def __post_init__(self) -> None:
         """Raise SettingError for values out of range."""
         good = isinstance(self.components, int) and 1 <= self.components <= 64
         require(good, "components", self.components, "a whole number from 1 to 64")
+        fine = self.fov_deg is None or _FOV_DEG[0] <= self.fov_deg <= _FOV_DEG[1]
+        require(fine, "sensor.fov_deg", self.fov_deg, f"from {_FOV_DEG[0]:.0f} to {_FOV_DEG[1]:.0f} to be tuned")
         require(math.exp(-4) <= self.alpha <= math.exp(4), "acquisition.alpha", self.alpha, "between 0.0183 and 54.6")
 
     @property
@@ -55,9 +61,19 @@ class Shape:
         return 9 * self.components + (self.components if self.components > 1 else 0)
 
     @property
+    def body(self) -> int:
+        """Numbers of all mixtures; α's comes next."""
+        return self.numbers * (6 if self.conditioned else 1)
+
+    @property
     def size(self) -> int:
         """Of the vector."""
-        return self.numbers * (6 if self.conditioned else 1) + int(self.tune_alpha)
+        return self.body + int(self.tune_alpha) + int(self.fov_deg is not None)
+
+    def tail(self, alpha: float, fov_deg: float | None) -> Tensor:
+        """The vector's last numbers."""
+        fov = [] if fov_deg is None else [math.log(math.tan(math.radians(fov_deg) / 2))]
+        return torch.tensor(([math.log(alpha)] if self.tune_alpha else []) + fov, dtype=torch.float64)
 
 
 class Bias(NamedTuple):
@@ -93,7 +109,7 @@ def decode(shape: Shape, vector: Tensor, task: Tensor) -> Bias:
     Returns:
         Mixtures with clamped log diagonals (−3 to 1), one for each scene if conditioned, else one. Differentiable.
     """
-    body = vector[: shape.size - shape.tune_alpha]
+    body = vector[: shape.body]
     raw = features(task) @ body.reshape(6, -1) if shape.conditioned else body[None]
     m = shape.components
     means = raw[:, : 3 * m].unflatten(1, (m, 3))
@@ -107,7 +123,7 @@ def decode(shape: Shape, vector: Tensor, task: Tensor) -> Bias:
         (lower[..., 1], lower[..., 2], diagonal[..., 2]),
     )
     cholesky = torch.stack([torch.stack(row, -1) for row in rows], -2)
-    log_alpha = vector[-1].clamp(*_LOG_ALPHA) if shape.tune_alpha else vector.new_tensor(math.log(shape.alpha))
+    log_alpha = vector[shape.body].clamp(*_LOG_ALPHA) if shape.tune_alpha else vector.new_tensor(math.log(shape.alpha))
     return Bias(logits, means, cholesky, log_alpha.exp())
 
 
@@ -137,8 +153,13 @@ def encode(shape: Shape, mixture: DirectionMixture, alpha: float) -> Tensor:
     body = torch.cat(parts)
     if shape.conditioned:
         body = torch.cat((body, torch.zeros(5 * len(body), dtype=torch.float64)))
-    tail = [torch.tensor([math.log(alpha)], dtype=torch.float64)] if shape.tune_alpha else []
-    return torch.cat([body, *tail])
+    return torch.cat([body, shape.tail(alpha, shape.fov_deg)])
+
+
+def fov_of(shape: Shape, vector: Tensor) -> float:
+    """The field of view [deg] that a vector of a shape with one stands for, 40 to 150."""
+    fov = 2 * math.degrees(math.atan(math.exp(float(vector[-1].clamp(-10, 10)))))
+    return min(max(fov, _FOV_DEG[0]), _FOV_DEG[1])
 
 
 def fix_vector(shape: Shape, vector: Tensor) -> Tensor:
@@ -148,12 +169,15 @@ def fix_vector(shape: Shape, vector: Tensor) -> Tensor:
     """
     vector = vector.clone()
     if shape.tune_alpha:
-        vector[-1] = vector[-1].clamp(*_LOG_ALPHA)
+        vector[shape.body] = vector[shape.body].clamp(*_LOG_ALPHA)
+    tail = vector[shape.body :]
+    if shape.fov_deg is not None:
+        tail[-1] = shape.tail(1.0, fov_of(shape, vector))[-1]
     if shape.conditioned:
         return vector.clamp(-_MEAN, _MEAN)
     bias = decode(shape, vector, vector.new_zeros(1, 2))
     mixture = DirectionMixture(bias.logits[0], bias.means[0], bias.cholesky[0])
-    return encode(shape, mixture, float(bias.alpha)).to(vector)
+    return torch.cat((encode(shape, mixture, float(bias.alpha)).to(vector)[: shape.body], tail))
 
 
 def mixture_of(shape: Shape, vector: Tensor, task: Tensor | None = None) -> DirectionMixture:

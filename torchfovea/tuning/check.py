@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchfovea.tuning.problem import Problem, play
 from torchfovea.tuning.scenes import stream
-from torchfovea.tuning.train import ESTIMATORS
+from torchfovea.tuning.train import gradient
 
 __all__ = ["Sample", "agreement", "estimate_gradient", "finite_differences", "slope_along"]
 
@@ -70,7 +70,7 @@ def estimate_gradient(problem: Problem, vector: Tensor, estimator: str, episodes
     """An estimator on `episodes` base scenes of its own, other than those of the differences."""
     count, size = _batches(episodes)
     found = [
-        ESTIMATORS[estimator](problem, vector, problem.batch(size, stream("validation", seed, k)), alpha_share=1.0)
+        gradient(problem, estimator, vector, problem.batch(size, stream("validation", seed, k)), 1.0)
         for k in range(count)
     ]
     return Sample(torch.stack([f.vector for f in found]), sum(f.episodes for f in found) / count)

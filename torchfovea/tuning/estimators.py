@@ -12,7 +12,7 @@ are drawn independently, so that E[∇ log p̃(p_i) f] = 0 for any f that does n
   counterfactual of R − f is unbiased too (but for the quadrature of m).
 - `coverage`: ∇F alone: no run at all. Biased, for F knows cells but no saccades; a warm start.
 
-α is not in p̃: its derivative is a central difference of log α with common random numbers.
+α and the field of view are not in p̃: their derivatives are central differences with common random numbers.
 """
 
 from __future__ import annotations
@@ -23,13 +23,24 @@ import torch
 from torch import Tensor
 
 from torchfovea.tuning.bias import Bias, log_density_each, log_normalizer_each
-from torchfovea.tuning.problem import Batch, Problem, prepare
+from torchfovea.tuning.problem import Batch, Problem, play, prepare
 from torchfovea.tuning.scenes import Scenes, cast, nearest_point
 from torchfovea.tuning.simulator import Memory, Run, World, blank, simulate
 
-__all__ = ["Credit", "Gradient", "alpha_difference", "counterfactual", "coverage", "covered", "finish", "pull"]
+__all__ = [
+    "Credit",
+    "Gradient",
+    "alpha_difference",
+    "counterfactual",
+    "coverage",
+    "covered",
+    "finish",
+    "fov_difference",
+    "pull",
+]
 
 _ALPHA_STEP = 0.25  # of log α, to either side
+_FOV_STEP = 0.15  # of log tan(fov/2)
 
 
 class Gradient(NamedTuple):
@@ -94,6 +105,18 @@ def alpha_difference(
     return float((value[:n] - value[n:]).mean() / (2 * _ALPHA_STEP)), 2.0 * n
 
 
+def fov_difference(problem: Problem, vector: Tensor, batch: Batch, share: float = 1.0) -> tuple[float, float]:
+    """Slope in log tan(fov/2), in α's way; and the episodes spent."""
+    n = round(share * len(batch.scenes.nearest_m))
+    if problem.shape.fov_deg is None or n < 1:
+        return 0.0, 0.0
+    part = Batch(batch.scenes.take(torch.arange(n)), batch.noise[:, :n], batch.seed)
+    offset = torch.zeros_like(vector)
+    offset[-1] = _FOV_STEP
+    value = play(problem, vector + offset, part).value - play(problem, vector - offset, part).value
+    return float(value.mean() / (2 * _FOV_STEP)), 2.0 * n
+
+
 def finish(
     problem: Problem, vector: Tensor, batch: Batch, world: World, credits: list[Credit], value: Tensor, episodes: float,
     runs: int, alpha_share: float,
@@ -102,7 +125,7 @@ def finish(
     gradient = pull(problem, vector, batch, credits)
     slope, spent = alpha_difference(problem, vector, batch, world, alpha_share)
     if problem.shape.tune_alpha:
-        gradient[-1] = slope
+        gradient[problem.shape.body] = slope
     return Gradient(gradient, float(value.mean()), episodes + spent, runs + round(spent))
 
 
@@ -145,7 +168,7 @@ def coverage(problem: Problem, vector: Tensor, batch: Batch, alpha_share: float 
     gradient, total = _coverage(problem, vector, batch.scenes, value)
     if problem.shape.tune_alpha and alpha_share > 0:
         world = prepare(problem, problem.bias(vector.detach(), batch.scenes), batch)
-        gradient[-1], spent = alpha_difference(problem, vector, batch, world, alpha_share)
+        gradient[problem.shape.body], spent = alpha_difference(problem, vector, batch, world, alpha_share)
         return Gradient(gradient, total, n + spent, n + round(spent))
     return Gradient(gradient, total, n, n)
 

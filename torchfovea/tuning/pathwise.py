@@ -87,7 +87,7 @@ def pathwise(problem: Problem, vector: Tensor, batch: Batch, alpha_share: float 
     spent = 0.0
     if problem.shape.tune_alpha:
         plain = prepare(problem, problem.bias(vector.detach(), batch.scenes), batch)
-        slope[-1], spent = alpha_difference(problem, vector, batch, plain, alpha_share)
+        slope[problem.shape.body], spent = alpha_difference(problem, vector, batch, plain, alpha_share)
     return Gradient(slope, float(value.detach().mean()), n + spent, n + round(spent))
 
 

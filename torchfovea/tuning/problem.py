@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from copy import copy
+from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from torchfovea.camera import Pinhole
 from torchfovea.setting import require
 from torchfovea.sphere import Quadrature, sphere_quadrature
-from torchfovea.tuning.bias import Bias, Shape, decode, draw_cells, reachable
+from torchfovea.tuning.bias import Bias, Shape, decode, draw_cells, fov_of, reachable
 from torchfovea.tuning.prior_field import PriorField, look_up
 from torchfovea.tuning.scenes import Distribution, Scenes, draw_scenes
 from torchfovea.tuning.simulator import Run, Task, World, check_observer, simulate, world_of
@@ -76,6 +79,15 @@ class Problem:
         """The vector's mixtures for some scenes. Differentiable in the vector."""
         return decode(self.shape, vector.to(self.dtype), scenes.task)
 
+    def at(self, vector: Tensor) -> Problem:
+        """The problem with the field of view that a vector stands for, where that is tuned."""
+        if self.shape.fov_deg is None:
+            return self
+        observer, other = self.task.observer, copy(self)
+        camera = Pinhole.from_fov(fov_of(self.shape, vector), observer.retina.radius_px)
+        other.task = self.task._replace(observer=replace(observer, camera=camera))
+        return other
+
 
 def prepare(problem: Problem, bias: Bias, batch: Batch) -> World:
     """Draw the cells of a batch and put them into its scenes."""
@@ -90,6 +102,7 @@ def prepare(problem: Problem, bias: Bias, batch: Batch) -> World:
 
 def play(problem: Problem, vector: Tensor, batch: Batch) -> Run:
     """The episodes of a batch with the hard policy; the same batch gives the same episodes."""
+    problem = problem.at(vector)
     bias = problem.bias(vector.detach(), batch.scenes)
     return simulate(problem.task, batch.scenes, prepare(problem, bias, batch), bias.alpha)
 

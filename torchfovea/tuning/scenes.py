@@ -100,6 +100,13 @@ class Distribution:
         require(0 <= self.margin_m <= 5, "distribution.margin_m", self.margin_m, "0 to 5 metres")
         require(self.tries >= 1, "distribution.tries", self.tries, "at least 1")
 
+    def region_of(self, a: float, e: float) -> tuple[float, float, float, float]:
+        """Where the target of a conditioned task (a, e) in [-1, 1]² may stand, as one of `regions`."""
+        left, right, low, high = self.regions[0]
+        azimuth, elevation = (left + right + a * (right - left)) / 2, (low + high + e * (high - low)) / 2
+        da, de = self.task_spread_deg
+        return azimuth - da, azimuth + da, elevation - de, elevation + de
+
 
 class Scenes(NamedTuple):
     """B scenes in E; lengths in metres.

@@ -16,12 +16,12 @@ from torchfovea.files import replacing
 from torchfovea.setting import SettingError, require
 from torchfovea.tuning.bias import fix_vector
 from torchfovea.tuning.candidates import corrected, insertion, myopic
-from torchfovea.tuning.estimators import Gradient, counterfactual, coverage, covered
+from torchfovea.tuning.estimators import Gradient, counterfactual, coverage, covered, fov_difference
 from torchfovea.tuning.pathwise import pathwise
-from torchfovea.tuning.problem import Problem, evaluate
+from torchfovea.tuning.problem import Batch, Problem, evaluate
 from torchfovea.tuning.scenes import stream
 
-__all__ = ["ESTIMATORS", "Progress", "Schedule", "State", "train"]
+__all__ = ["ESTIMATORS", "Progress", "Schedule", "State", "gradient", "train"]
 
 ESTIMATORS: dict[str, Callable[..., Gradient]] = {
     "covered": covered,
@@ -32,6 +32,16 @@ ESTIMATORS: dict[str, Callable[..., Gradient]] = {
     "myopic": myopic,
     "pathwise": pathwise,
 }
+
+
+def gradient(problem: Problem, estimator: str, vector: Tensor, batch: Batch, alpha_share: float) -> Gradient:
+    """An estimator's gradient, with the slope in the field of view where that is tuned."""
+    found = ESTIMATORS[estimator](problem.at(vector), vector, batch, alpha_share=alpha_share)
+    if problem.shape.fov_deg is not None:
+        slope, spent = fov_difference(problem, vector, batch, alpha_share)
+        found.vector[-1] = slope
+        found = found._replace(episodes=found.episodes + spent, runs=found.runs + round(spent))
+    return found
 
 
 @dataclass(frozen=True)
@@ -157,9 +167,9 @@ def _begin(problem: Problem, start: Tensor, schedule: Schedule, checkpoint: Path
 
 def _step(problem: Problem, schedule: Schedule, state: State) -> tuple[State, float]:
     warm = state.episodes < min(schedule.warm_episodes, schedule.episodes / 2)
-    estimate = ESTIMATORS[schedule.warm_estimator if warm else schedule.estimator]
+    name = schedule.warm_estimator if warm else schedule.estimator
     batch = problem.batch(schedule.scenes, stream("training", schedule.seed, state.step))
-    found = estimate(problem, state.vector, batch, alpha_share=0.0 if warm else schedule.alpha_share)
+    found = gradient(problem, name, state.vector, batch, 0.0 if warm else schedule.alpha_share)
     if not bool(torch.isfinite(found.vector).all()):
         raise SettingError(
             f"gradient = not finite at step {state.step}: expected finite numbers; stopped at the last checkpoint, "
