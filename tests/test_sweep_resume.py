@@ -64,6 +64,20 @@ def test_a_killed_sweep_resumes_to_the_same_table(whole, tmp_path, capsys):
     assert table(folder) == table(whole)
 
 
+def test_the_sweep_of_fig_5_makes_only_what_is_missing(tmp_path):
+    command = [
+        "characterize", "experiment=fig5", "profile=quick", "sensor.receptive_fields=100", "distances=2",
+        "vergences=2", "advantage_source_px=[200]", f"hydra.sweep.dir={tmp_path / 'fig5'}",
+    ]  # fmt: skip
+    assert main(command) == 0
+    results = sorted((tmp_path / "fig5").rglob("result.json"))
+    assert len(results) == 4  # two fields of view, two baselines
+    results[0].unlink()
+    kept = {path: path.stat().st_mtime_ns for path in results[1:]}
+    assert main(command) == 0
+    assert results[0].exists() and {path: path.stat().st_mtime_ns for path in kept} == kept
+
+
 def test_other_settings_are_refused_and_nothing_is_overwritten(whole, capsys):
     ours = ("manifest.json", "result.json", "episodes.csv", "saccades.csv")
     before = {path: path.read_bytes() for path in whole.rglob("*") if path.name in ours}

@@ -87,7 +87,7 @@ def draw_arms(path: Path, rows: Rows, title: str) -> None:
 def _order(arm: str) -> tuple[int, float, str]:
     if arm.startswith("ucb_") and arm != "ucb_cost":
         return 0, float(arm.removeprefix("ucb_")), arm
-    return 1 + (arm not in ("pi", "ei")), 0.0, arm
+    return {"pi": 1, "ei": 2}.get(arm, 3), 0.0, arm
 
 
 def draw_course(path: Path, groups: Mapping[str, tuple[str, Rows]], title: str) -> None:

@@ -28,6 +28,7 @@ from torchfovea.config import run_folder
 from torchfovea.correspondence import Budget
 from torchfovea.experiments.build import build_sensor, construct, number, whole
 from torchfovea.experiments.honesty import CHUNK, plan_cases, plan_planes, propagate, realise, wholes
+from torchfovea.experiments.manifest import finished
 from torchfovea.files import write_csv, write_result
 from torchfovea.layout import LogPolar, Uniform
 from torchfovea.setting import require
@@ -57,6 +58,9 @@ def run(cfg: DictConfig) -> float:
     generator = torch.Generator().manual_seed(whole(cfg, "seed", 0))
     layouts = _small_layouts(cfg)
     folder = run_folder()
+    done_before = finished(cfg, folder, "foveal_advantage_min_nats")
+    if done_before is not None:
+        return done_before
     bars = (
         TextColumn("{task.description}"),
         BarColumn(),
