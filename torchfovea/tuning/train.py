@@ -15,8 +15,8 @@ from torch import Tensor
 from torchfovea.files import replacing
 from torchfovea.setting import SettingError, require
 from torchfovea.tuning.bias import fix_vector
-from torchfovea.tuning.candidates import corrected, insertion, myopic
 from torchfovea.tuning.estimators import Gradient, counterfactual, coverage, covered, fov_difference
+from torchfovea.tuning.myopic import myopic
 from torchfovea.tuning.pathwise import pathwise
 from torchfovea.tuning.problem import Batch, Problem, evaluate
 from torchfovea.tuning.scenes import stream
@@ -27,8 +27,6 @@ ESTIMATORS: dict[str, Callable[..., Gradient]] = {
     "covered": covered,
     "counterfactual": counterfactual,
     "coverage": coverage,
-    "insertion": insertion,
-    "corrected": corrected,
     "myopic": myopic,
     "pathwise": pathwise,
 }
