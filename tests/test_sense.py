@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from torchfovea.cli import main
-from torchfovea.experiments.images import read_disparity, read_image, write_ply
+from torchfovea.disparity_files import load_disparity
+from torchfovea.experiments.images import read_image, write_ply
 from torchfovea.setting import SettingError
 
 SIZE = (160, 200)
@@ -84,7 +85,7 @@ def test_offset_axes_are_the_same_geometry(folder, capsys, plane):
         (["left=left.png", "right=nan.npy"], "NaN or infinite"),
         (["OWN", "baseline_m=0"], "baseline_m = 0: expected a positive number"),
         (["OWN", "focal_px=wide"], "focal_px = wide: expected a number"),
-        (["OWN", "disparity=left.png"], "disparity = left.png: expected a PFM"),
+        (["OWN", "disparity=left.png"], "disparity = left.png: expected a disparity map"),
         (["OWN", "disparity=half.npy"], "disparity = (80, 100)"),
     ],
 )
@@ -116,11 +117,13 @@ def test_disparity_files(tmp_path):
     cv2.imwrite(str(tmp_path / "a.pfm"), truth)
     cv2.imwrite(str(tmp_path / "a.png"), (truth * 256).astype(np.uint16))
     for name in ("a.npy", "a.npz", "a.pfm"):
-        np.testing.assert_array_equal(read_disparity(tmp_path / name, "disparity"), truth)
-    np.testing.assert_array_equal(read_disparity(tmp_path / "a.png", "disparity"), np.where(truth == 0, np.nan, truth))
+        np.testing.assert_array_equal(load_disparity(tmp_path / name, "disparity")[0], truth)
+    np.testing.assert_array_equal(
+        load_disparity(tmp_path / "a.png", "disparity")[0], np.where(truth == 0, np.nan, truth)
+    )
     (tmp_path / "b.npy").write_text("x")
     with pytest.raises(SettingError, match=r"disparity = .*b\.npy"):
-        read_disparity(tmp_path / "b.npy", "disparity")
+        load_disparity(tmp_path / "b.npy", "disparity")
     assert read_image(tmp_path / "a.npy", "left").shape == (3, 3, 4)
 
 

@@ -19,10 +19,11 @@ from torch import Tensor
 from torchfovea.calibration import Judged, Likelihood, concatenate, fit_budget, judge, select, sigma_of
 from torchfovea.config import run_folder
 from torchfovea.correspondence import Budget
-from torchfovea.experiments.build import build_scene_of, build_sensor, choice, construct, whole
-from torchfovea.experiments.truths import Matcher, Truths, build_truths_matcher, look_at_pair, look_at_world
+from torchfovea.experiments.build import build_matcher, build_scene_of, build_sensor, choice, construct, whole
+from torchfovea.experiments.truths import Truths, look_at_pair, look_at_world
 from torchfovea.files import replacing, write_csv, write_result
 from torchfovea.head import Gaze, Head, fixate
+from torchfovea.matchers import Matcher
 from torchfovea.setting import SettingError, require
 from torchfovea.sim.scene import Scene
 from torchfovea.sim.world import World
@@ -64,7 +65,7 @@ def run(cfg: DictConfig) -> float:
     start = replace(budget, source_px=whole(cfg, "sensor.source_px", 16))
     likelihood = construct(Likelihood, cfg.fit, "fit")
     edges = _edges(cfg, "range_edges_m"), _edges(cfg, "eccentricity_edges_deg")
-    matcher, folder = build_truths_matcher(cfg), run_folder()
+    matcher, folder = build_matcher(cfg), run_folder()
     data: dict[str, Split] = {}
     if scenes:
         data["simulated"] = _simulate(cfg, start, matcher, scenes, judged_scenes, looks, seed)

@@ -1,4 +1,4 @@
-"""Reading what users have, images and disparities, and writing points for their viewers."""
+"""Reading images that users have, and writing points for their viewers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 from torchfovea.files import replacing
 from torchfovea.setting import SettingError, require
 
-__all__ = ["read_disparity", "read_image", "write_ply"]
+__all__ = ["read_image", "write_ply"]
 
 
 def _exists(path: Path, setting: str) -> None:
@@ -44,30 +44,6 @@ def read_image(path: Path, setting: str) -> Tensor:
     image = torch.from_numpy(np.ascontiguousarray(pixels)).float().movedim(-1, 0) / scale
     require(bool(torch.isfinite(image).all()), setting, f"{path} with NaN or infinite pixels", "finite values")
     return image
-
-
-def read_disparity(path: Path, setting: str) -> Tensor:
-    """A disparity map (H, W) in pixels; not finite where unknown.
-
-    Args:
-        path: PFM, NPY, NPZ (its first array), or 16-bit PNG in 1/256 px with 0 for unknown (KITTI's).
-        setting: the name of the setting, for errors.
-
-    Raises:
-        SettingError: for a file that is missing or of another form.
-    """
-    import cv2
-
-    _exists(path, setting)
-    if path.suffix.lower() in (".npy", ".npz"):
-        values = _array(path, setting)
-    else:
-        loaded = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        if loaded is None or loaded.ndim != 2 or loaded.dtype not in (np.float32, np.uint16):
-            raise SettingError(f"{setting} = {path}: expected a PFM, NPY, NPZ or 16-bit PNG disparity")
-        values = loaded if loaded.dtype == np.float32 else np.where(loaded == 0, np.nan, loaded / 256.0)
-    require(values.ndim == 2, setting, values.shape, "an array (H, W)")
-    return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
 
 
 def _array(path: Path, setting: str) -> np.ndarray:

@@ -16,8 +16,9 @@ from torchfovea.camera import Pinhole
 from torchfovea.chart import cartesian_from_inverse_range
 from torchfovea.config import run_folder
 from torchfovea.correspondence import Budget
+from torchfovea.disparity_files import load_disparity
 from torchfovea.experiments.build import build_matcher, build_sensor, choice, construct, number, whole
-from torchfovea.experiments.images import read_disparity, read_image, write_ply
+from torchfovea.experiments.images import read_image, write_ply
 from torchfovea.files import replacing, write_result
 from torchfovea.gaussian import Gaussian
 from torchfovea.head import Eyes
@@ -227,7 +228,7 @@ def load_pair(cfg: DictConfig) -> Pair:
             )
     focal, baseline = number(cfg, "focal_px"), number(cfg, "baseline_m")
     cx, cy, doffs = float(cfg.cx_px), float(cfg.cy_px), float(cfg.doffs_px)
-    truth = None if cfg.disparity is None else read_disparity(Path(cfg.disparity), "disparity")
+    truth = None if cfg.disparity is None else load_disparity(Path(cfg.disparity), "disparity")[0]
     if truth is not None:
         require(
             truth.shape == left.shape[-2:], "disparity", tuple(truth.shape), f"the images' {tuple(left.shape[-2:])}"

@@ -13,26 +13,18 @@ from torchfovea.calibration import Judged, judged
 from torchfovea.camera import Camera
 from torchfovea.confidence import read_clues
 from torchfovea.correspondence import Budget, Clues, Correspondences, Disparity
-from torchfovea.experiments.build import build_sensor, choice, construct, number
+from torchfovea.experiments.build import build_sensor
 from torchfovea.experiments.sense import load_pair
 from torchfovea.head import Eyes, Gaze, eyes
 from torchfovea.layout import Retina
-from torchfovea.matching import match_sgbm
-from torchfovea.rectified import match_disparity, match_rectified
-from torchfovea.rig import StereoRig, verged
+from torchfovea.matchers import Matcher, match_eyes, match_pair
+from torchfovea.rectified import match_disparity
+from torchfovea.rig import verged
 from torchfovea.setting import SettingError, require
-from torchfovea.sgbm import SGBM
 from torchfovea.sim.world import World
-from torchfovea.sweep import Sweep, match_sweep
+from torchfovea.sweep import Sweep
 
-__all__ = ["Matcher", "Truths", "build_truths_matcher", "look_at_pair", "look_at_world"]
-
-
-class Matcher(NamedTuple):
-    """A matcher's parameters and the nearest range that it searches [m]."""
-
-    params: SGBM | Sweep
-    nearest_m: float
+__all__ = ["Truths", "look_at_pair", "look_at_world"]
 
 
 class Truths(NamedTuple):
@@ -49,27 +41,16 @@ class Truths(NamedTuple):
     valid_fraction: float
 
 
-def build_truths_matcher(cfg: DictConfig) -> Matcher:
-    """The matcher to calibrate."""
-    name = choice(cfg, "matcher.name", ("sgbm", "sweep"))
-    kind: type[SGBM] | type[Sweep] = SGBM if name == "sgbm" else Sweep
-    return Matcher(construct(kind, cfg.matcher, "matcher"), number(cfg, "matcher.nearest_range_m"))
-
-
 def look_at_world(world: World, gaze: Gaze, retina: Retina, budget: Budget, matcher: Matcher) -> Truths:
     """Match both eyes' pictures; the truth is cast along the left receptive fields' rays."""
     left, right = (frame.image for frame in world.images(gaze))
     rig, pose = verged(gaze.vergence, world.head.baseline_m), eyes(world.head, gaze)
+    matches, found = match_eyes(matcher, left, right, rig, world.camera, retina, budget)
     clues = None
-    if isinstance(matcher.params, SGBM):
-        matches, disparity = match_sgbm(
-            left, right, rig, world.camera, retina, matcher.params, budget, matcher.nearest_m
-        )
-        place = disparity.camera.project(world.camera.rays(matches.left_px) @ rig.R_left.to(matches.left_px).mT)
-        other = disparity.camera.project(world.camera.rays(matches.right_px) @ rig.R_right.to(matches.left_px).mT)
-        clues = _clues(disparity, place, (place - other)[:, 0], retina, world.source_px)
-    else:
-        matches, _ = match_sweep(left, right, rig, world.camera, retina, matcher.params, budget, matcher.nearest_m)
+    if isinstance(found, Disparity):
+        place = found.camera.project(world.camera.rays(matches.left_px) @ rig.R_left.to(matches.left_px).mT)
+        other = found.camera.project(world.camera.rays(matches.right_px) @ rig.R_right.to(matches.left_px).mT)
+        clues = _clues(found, place, (place - other)[:, 0], retina, world.source_px)
     seen = world.correspond(gaze, world.camera.rays(matches.left_px))
     away = torch.linalg.vector_norm(seen.points_e.double() - pose.t_left, dim=-1)
     truth = torch.where(seen.hit, 1 / away, torch.zeros_like(away))
@@ -100,19 +81,11 @@ def look_at_pair(cfg: DictConfig, budget: Budget, matcher: Matcher) -> Truths:
     pose = Eyes(same, torch.zeros(3), same, torch.tensor([pair.baseline_m, 0.0, 0.0]))
     source = min(height, width)
     budget = replace(budget, source_px=source)
-    clues = None
-    if isinstance(matcher.params, SGBM):
-        found = match_rectified(
-            pair.left, pair.right, *cameras, retina, gaze, matcher.params, budget, matcher.nearest_m
-        )
-        matches = found.correspondences
+    found = match_pair(matcher, pair.left, pair.right, *cameras, retina, gaze, budget)
+    matches, clues = found.correspondences, None
+    if not isinstance(matcher.params, Sweep):  # whose map is its receptive fields'
         shift = (matches.left_px - matches.right_px)[:, 0] * scale
         clues = _clues(found.disparity, place, shift, retina, source)
-    else:
-        matches, _ = match_sweep(
-            pair.left, pair.right, StereoRig(same, same, pair.baseline_m), true.camera_left, retina, matcher.params,
-            budget, matcher.nearest_m, camera_right=true.camera_right, gaze_px=gaze,
-        )  # fmt: skip
     truth = _inverse_range(true.correspondences, true.camera_left, true.camera_right, pair.baseline_m)
     truth = torch.where(true.correspondences.valid, truth, torch.zeros_like(truth))
     data, which = judged(matches, pose, true.camera_left, retina, budget, truth, clues, true.camera_right)
