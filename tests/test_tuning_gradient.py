@@ -32,10 +32,10 @@ from torchfovea.tuning.bias import (
     reachable,
 )  # fmt: skip
 from torchfovea.tuning.check import Sample, agreement, estimate_gradient, finite_differences, slope_along
-from torchfovea.tuning.estimators import counterfactual
+from torchfovea.tuning.estimators import alpha_difference, counterfactual
 from torchfovea.tuning.pathwise import panorama
 from torchfovea.tuning.prior_field import fit_by_gradient, fit_closed_form, look_up
-from torchfovea.tuning.problem import Problem, evaluate, play, prepare
+from torchfovea.tuning.problem import Problem, evaluate, play, play_each, prepare
 from torchfovea.tuning.scenes import Distribution, cast, draw_scenes, stream
 from torchfovea.tuning.simulator import Task, simulate
 from torchfovea.tuning.study import Heldout, budgets_up_to, curves, episodes_to_reach, student
@@ -121,6 +121,17 @@ def test_same_seed_same_episodes():
     assert not torch.equal(first.value, play(p, x, p.batch(5, stream("training", 4))).value)
 
 
+@pytest.mark.parametrize("shape", [{}, {"conditioned": True}, {"fov_deg": 80.0}], ids=str)
+def test_several_vectors_are_played_as_each(shape):
+    p = problem(cells=12, saccades=4, distribution=Distribution(cans=3, conditioned="conditioned" in shape), **shape)
+    batch = p.batch(5, stream("training", 0))
+    vectors = [vector(p.shape), vector(p.shape, [-1.0, 0.0, 0.0], 1e-3), vector(p.shape, alpha=0.3)]
+    first, out, last = play_each(p, vectors, batch)
+    assert out == -1
+    assert (first, last) == tuple(pytest.approx(float(play(p, v, batch).value.mean())) for v in vectors[::2])
+    assert play_each(p, vectors[1:2], batch) == [-1.0]
+
+
 def test_a_cell_is_worth_what_its_removal_costs():
     """Restarted counterfactuals equal whole episodes without the cell; cells never fixated are worth nothing."""
     from torchfovea.tuning.estimators import _removals
@@ -128,8 +139,11 @@ def test_a_cell_is_worth_what_its_removal_costs():
     p = problem(cells=12, saccades=5, dtype=torch.float64)
     batch = p.batch(3, stream("training", 0))
     bias = p.bias(vector(p.shape), batch.scenes)
-    world, run, credit, spent = _removals(p, bias, batch)
-    assert 0 < spent <= len(credit.scene)
+    removals = _removals(p, bias, batch, 0.7)
+    world, value, credit = removals.world, removals.value, removals.credit
+    assert 3 < removals.episodes <= removals.runs == 3 + len(credit.scene) + 4
+    slope, spent = alpha_difference(p, vector(p.shape), batch, world, 0.7)
+    assert removals.slope == pytest.approx(slope) and spent == 4
     found = {}
     for scene, direction, weight in zip(*credit, strict=True):
         cell = int((world.direction[scene] @ direction).argmax())
@@ -138,7 +152,7 @@ def test_a_cell_is_worth_what_its_removal_costs():
         for i in range(12):
             one = world._replace(allowed=world.allowed.clone())
             one.allowed[b, i] = False
-            loss = float((run.value - simulate(p.task, batch.scenes, one, bias.alpha).value)[b])
+            loss = float((value - simulate(p.task, batch.scenes, one, bias.alpha).value)[b])
             assert found.get((b, i), 0.0) == pytest.approx(loss, abs=1e-12)
 
 

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchfovea.setting import SettingError
 from torchfovea.sphere import direction_mixture
 from torchfovea.tuning.bias import Shape, encode, features, fix_vector
-from torchfovea.tuning.problem import Problem, evaluate, play
+from torchfovea.tuning.problem import Problem, evaluate, play_each
 from torchfovea.tuning.scenes import Distribution, stream
 
 __all__ = ["SEARCHES", "TABLE_1", "hand", "table_1"]
@@ -91,10 +90,11 @@ def _conditioned_hand(shape: Shape, distribution: Distribution, sigma: float, al
     return torch.cat([body.flatten(), shape.tail(alpha, shape.fov_deg)])
 
 
-def _objective(problem: Problem, seed: int, per_evaluation: int) -> Callable[[Tensor, int], float]:
-    def objective(vector: Tensor, key: int) -> float:
-        batch = problem.batch(per_evaluation, stream("training", seed, key))
-        return float(play(problem, vector, batch).value.mean())
+def _objective(problem: Problem, seed: int, per_evaluation: int) -> Callable[[Sequence[Tensor], int], list[float]]:
+    """Of several vectors on the same scenes; −1 for a bias that never falls within reach."""
+
+    def objective(vectors: Sequence[Tensor], key: int) -> list[float]:
+        return play_each(problem, vectors, problem.batch(per_evaluation, stream("training", seed, key)))
 
     return objective
 
@@ -123,10 +123,7 @@ def random_search(problem: Problem, start: Tensor, episodes: int, seed: int, per
     objective, best, spent, key = _objective(problem, seed, per_evaluation), (-math.inf, start), 0, 0
     while spent < episodes:
         vector = start if key == 0 else low + (high - low) * torch.rand(len(low), generator=rng, dtype=torch.float64)
-        try:
-            value = objective(vector, key)
-        except SettingError:  # a bias that never falls within reach
-            value = -1.0
+        (value,) = objective([vector], key)
         best = max(best, (value, vector), key=lambda item: item[0])
         spent, key = spent + per_evaluation, key + 1
         yield spent, best[1]
@@ -141,13 +138,7 @@ def cma_es(problem: Problem, start: Tensor, episodes: int, seed: int, per_evalua
     objective, spent, key = _objective(problem, seed, per_evaluation), 0, 0
     while spent < episodes:
         asked = strategy.ask()
-        losses = []
-        for x in asked:
-            try:
-                losses.append(-objective(torch.tensor(np.asarray(x)), key))
-            except SettingError:
-                losses.append(1.0)
-        strategy.tell(asked, losses)
+        strategy.tell(asked, [-value for value in objective([torch.tensor(np.asarray(x)) for x in asked], key)])
         spent, key = spent + per_evaluation * len(asked), key + 1
         yield spent, torch.tensor(np.asarray(strategy.result.xfavorite))
 
@@ -168,10 +159,7 @@ def tpe(problem: Problem, start: Tensor, episodes: int, seed: int, per_evaluatio
         vector = torch.tensor(
             [trial.suggest_float(f"x{i}", a, b) for i, (a, b) in enumerate(bounds)], dtype=torch.float64
         )
-        try:
-            study.tell(trial, objective(vector, key))
-        except SettingError:
-            study.tell(trial, -1.0)
+        study.tell(trial, objective([vector], key)[0])
         spent, key = spent + per_evaluation, key + 1
         best = study.best_params
         yield spent, torch.tensor([best[f"x{i}"] for i in range(len(low))], dtype=torch.float64)
@@ -185,12 +173,11 @@ def finite_differences(
     objective, spent, key = _objective(problem, seed, per_evaluation), 0, 0
     first, second = torch.zeros_like(vector), torch.zeros_like(vector)
     cost, h = 2 * per_evaluation * len(vector), 0.2
+    offsets = h * torch.eye(len(vector), dtype=torch.float64)
     while spent < episodes:
-        slope = torch.zeros_like(vector)
-        for i in range(len(vector)):
-            offset = torch.zeros_like(vector)
-            offset[i] = h
-            slope[i] = (objective(vector + offset, key) - objective(vector - offset, key)) / (2 * h)
+        sides = objective([*(vector + offsets), *(vector - offsets)], key)
+        ahead, behind = torch.tensor(sides, dtype=torch.float64).chunk(2)
+        slope = (ahead - behind) / (2 * h)
         spent, key = spent + cost, key + 1
         first, second = 0.9 * first + 0.1 * slope, 0.98 * second + 0.02 * slope.square()
         rate = 0.1 - 0.08 * min(spent / episodes, 1)

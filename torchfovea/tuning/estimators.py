@@ -25,7 +25,7 @@ from torch import Tensor
 from torchfovea.tuning.bias import Bias, log_density_each, log_normalizer_each
 from torchfovea.tuning.problem import Batch, Problem, play, prepare
 from torchfovea.tuning.scenes import Scenes, cast, nearest_point
-from torchfovea.tuning.simulator import Memory, Run, World, blank, simulate
+from torchfovea.tuning.simulator import Memory, World, blank, simulate
 
 __all__ = [
     "Credit",
@@ -129,17 +129,35 @@ def finish(
     return Gradient(gradient, float(value.mean()), episodes + spent, runs + round(spent))
 
 
+class _Removals(NamedTuple):
+    """What the cells of B episodes were worth.
+
+    world: of the episodes; value: of them (B,); credit: of every fixated cell; slope: in log α; episodes and runs:
+    spent.
+    """
+
+    world: World
+    value: Tensor
+    credit: Credit
+    slope: float
+    episodes: float
+    runs: int
+
+
 def counterfactual(problem: Problem, vector: Tensor, batch: Batch, alpha_share: float = 0.25) -> Gradient:
     """Leave one fixated cell out: unbiased for the hard policy; runs restart at the cell's first fixation."""
-    bias = problem.bias(vector.detach(), batch.scenes)
-    world, run, credit, spent = _removals(problem, bias, batch)
-    n = len(batch.scenes.nearest_m)
-    runs = n + len(credit.scene)
-    return finish(problem, vector, batch, world, [credit], run.value, n + spent, runs, alpha_share)
+    found = _removals(problem, problem.bias(vector.detach(), batch.scenes), batch, alpha_share)
+    return _gradient(problem, pull(problem, vector, batch, [found.credit]), found)
 
 
-def _removals(problem: Problem, bias: Bias, batch: Batch) -> tuple[World, Run, Credit, float]:
-    """Episodes, and what each fixated cell was worth; with the episodes that this took besides."""
+def _gradient(problem: Problem, vector: Tensor, found: _Removals) -> Gradient:
+    if problem.shape.tune_alpha:
+        vector[problem.shape.body] = found.slope
+    return Gradient(vector, float(found.value.mean()), found.episodes, found.runs)
+
+
+def _removals(problem: Problem, bias: Bias, batch: Batch, alpha_share: float = 0.0) -> _Removals:
+    """Play the batch, then all that is compared with it at once: without each fixated cell, and with other α."""
     task, n = problem.task, len(batch.scenes.nearest_m)
     world = prepare(problem, bias, batch)
     run = simulate(task, batch.scenes, world, bias.alpha, keep=True)
@@ -148,14 +166,21 @@ def _removals(problem: Problem, bias: Bias, batch: Batch) -> tuple[World, Run, C
     # a cell of −1 counts as a last one, dropped
     first = first.scatter_reduce(1, run.cell % (problem.cells + 1), times, "amin")[:, :-1]
     scene, cell = (first < task.saccades).nonzero(as_tuple=True)
-    made = first[scene, cell] - 1
-    memory = Memory(*(torch.stack(parts)[made, scene] for parts in zip(*run.memories, strict=True)))
-    without = world.take(scene)
-    without.allowed[torch.arange(len(scene)), cell] = False
-    other = simulate(task, batch.scenes.take(scene), without, bias.alpha, (memory, made, run.reward[scene]))
-    weight = run.value[scene] - other.value
-    spent = float((task.saccades - 1 - made).sum()) / (task.saccades - 1)
-    return world, run, Credit(scene, world.direction[scene, cell], weight), spent
+    k, m = len(scene), max(1, round(alpha_share * n)) if problem.shape.tune_alpha and alpha_share > 0 else 0
+    part = torch.arange(m)
+    of = torch.cat((scene, part, part))
+    made = torch.cat((first[scene, cell] - 1, torch.zeros(2 * m, dtype=torch.long)))
+    steps = torch.cat((torch.zeros(k), torch.full((m,), _ALPHA_STEP), torch.full((m,), -_ALPHA_STEP)))
+    memory = Memory(*(torch.stack(parts)[made, of] for parts in zip(*run.memories, strict=True)))
+    other = world.take(of)
+    other.allowed[torch.arange(k), cell] = False
+    start = (memory, made, run.reward[of])
+    value = simulate(task, batch.scenes.take(of), other, bias.alpha * steps.exp().to(bias.alpha), start).value
+    more, less = value[k : k + m], value[k + m :]
+    slope = float((more - less).mean() / (2 * _ALPHA_STEP)) if m else 0.0
+    credit = Credit(scene, world.direction[scene, cell], run.value[scene] - value[:k])
+    spent = n + float((task.saccades - 1 - made).sum()) / (task.saccades - 1)
+    return _Removals(world, run.value, credit, slope, spent, n + k + 2 * m)
 
 
 def coverage(problem: Problem, vector: Tensor, batch: Batch, alpha_share: float = 0.0) -> Gradient:
@@ -175,21 +200,16 @@ def coverage(problem: Problem, vector: Tensor, batch: Batch, alpha_share: float 
 
 def covered(problem: Problem, vector: Tensor, batch: Batch, alpha_share: float = 0.25) -> Gradient:
     """`counterfactual` with coverage as control variate."""
-    bias = problem.bias(vector.detach(), batch.scenes)
-    world, run, credit, spent = _removals(problem, bias, batch)
-    value = _values(problem, batch.scenes)
+    found = _removals(problem, problem.bias(vector.detach(), batch.scenes), batch, alpha_share)
+    cells, value = found.world.direction, _values(problem, batch.scenes)
     # f(P) − f(P∖p_i) is not zero only for the one cell on the best can that is covered
-    on = cast(batch.scenes, torch.zeros_like(world.direction[:, :1]), world.direction).can
+    on = cast(batch.scenes, torch.zeros_like(cells[:, :1]), cells).can
     worth = torch.cat((value, torch.zeros_like(value[:, :1])), 1).gather(1, on % (value.shape[1] + 1))
     (best, second), which = worth.topk(2, 1).values.unbind(1), worth.argmax(1)
-    n = len(value)
-    scene = torch.arange(n)
-    luck = Credit(scene, world.direction[scene, which], second - best)
-    gradient = finish(
-        problem, vector, batch, world, [credit, luck], run.value, n + spent, n + len(credit.scene), alpha_share
-    )
+    scene = torch.arange(len(value))
+    luck = Credit(scene, cells[scene, which], second - best)
     slope, _ = _coverage(problem, vector, batch.scenes, value)
-    return gradient._replace(vector=gradient.vector + slope)
+    return _gradient(problem, pull(problem, vector, batch, [found.credit, luck]) + slope, found)
 
 
 def _values(problem: Problem, scenes: Scenes) -> Tensor:

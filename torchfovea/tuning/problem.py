@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import suppress
 from copy import copy
 from dataclasses import replace
 from functools import cached_property
@@ -11,14 +13,14 @@ import torch
 from torch import Tensor
 
 from torchfovea.camera import Pinhole
-from torchfovea.setting import require
+from torchfovea.setting import SettingError, require
 from torchfovea.sphere import Quadrature, sphere_quadrature
 from torchfovea.tuning.bias import Bias, Shape, decode, draw_cells, fov_of, reachable
 from torchfovea.tuning.prior_field import PriorField, look_up
 from torchfovea.tuning.scenes import Distribution, Scenes, draw_scenes
 from torchfovea.tuning.simulator import Run, Task, World, check_observer, simulate, world_of
 
-__all__ = ["Batch", "Problem", "evaluate", "play", "prepare"]
+__all__ = ["Batch", "Problem", "evaluate", "play", "play_each", "prepare"]
 
 _QUADRATURE = 12000  # directions on the whole sphere
 
@@ -105,6 +107,34 @@ def play(problem: Problem, vector: Tensor, batch: Batch) -> Run:
     problem = problem.at(vector)
     bias = problem.bias(vector.detach(), batch.scenes)
     return simulate(problem.task, batch.scenes, prepare(problem, bias, batch), bias.alpha)
+
+
+def play_each(problem: Problem, vectors: Sequence[Tensor], batch: Batch) -> list[float]:
+    """Mean value of a batch for each of several vectors, as `play` has it, all at once; −1 for one out of reach."""
+    if problem.shape.fov_deg is not None:  # every vector has a sensor of its own
+        return [_value(problem, vector, batch) for vector in vectors]
+    worlds, alphas, found = [], [], [-1.0] * len(vectors)
+    inside = []
+    n = len(batch.scenes.nearest_m)
+    for k, vector in enumerate(vectors):
+        bias = problem.bias(vector.detach(), batch.scenes)
+        with suppress(SettingError):
+            worlds.append(prepare(problem, bias, batch))
+            alphas.append(bias.alpha.expand(n))
+            inside.append(k)
+    if inside:
+        together = World(*(torch.cat(parts, 1 if i == 2 else 0) for i, parts in enumerate(zip(*worlds, strict=True))))
+        scenes = batch.scenes.take(torch.arange(n).repeat(len(inside)))
+        value = simulate(problem.task, scenes, together, torch.cat(alphas)).value
+        for k, mean in zip(inside, value.reshape(-1, n).mean(1).tolist(), strict=True):
+            found[k] = mean
+    return found
+
+
+def _value(problem: Problem, vector: Tensor, batch: Batch) -> float:
+    with suppress(SettingError):
+        return float(play(problem, vector, batch).value.mean())
+    return -1.0
 
 
 def evaluate(problem: Problem, vector: Tensor, scenes: int, generator: torch.Generator, at_once: int = 256) -> Tensor:
