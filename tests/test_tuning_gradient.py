@@ -206,6 +206,7 @@ def test_agreement_sees_through_noise():
     found = agreement(noisy(1.2, 4000), noisy(1.0, 400), (unit, slope))
     assert found["norm"] == pytest.approx(5, abs=3 * found["norm_error"] + 0.3)
     assert found["norm_ratio"] == pytest.approx(1.2, abs=3 * found["norm_ratio_error"] + 0.1)
+    assert found["cosine"] < 0.98 and found["cosine_without_noise"] == pytest.approx(1, abs=0.25)
     assert found["snr_32_episodes"] == pytest.approx(6 / 40, rel=0.2)
     alone = agreement(noisy(1.2, 4000), noisy(1.0, 4000))
     assert alone["norm"] == pytest.approx(5, abs=3 * alone["norm_error"]) and alone["cosine"] > 0.9

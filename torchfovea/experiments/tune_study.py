@@ -44,7 +44,8 @@ _SUMMARY_COLUMNS = (
 # `ratio`: of the first method's episodes to this one's, the median and ends of its bootstrap over seeds
 _REACH_COLUMNS = ("method", "level", "episodes", "low", "high", "ratio_low", "ratio", "ratio_high")
 _GRADIENT_COLUMNS = (
-    "point", "estimator", "cosine", "norm_ratio", "norm_ratio_error", "norm", "norm_error", "snr_32_episodes",
+    "point", "estimator", "cosine", "cosine_without_noise", "norm_ratio", "norm_ratio_error", "norm", "norm_error",
+    "snr_32_episodes",
 )  # fmt: skip
 
 

@@ -23,7 +23,6 @@ _LOG_DIAGONAL = (-3.0, 1.0)
 _LOG_ALPHA = (-4.0, 4.0)
 _MEAN = 4.0
 _FOV_DEG = (40.0, 150.0)
-_BLOCK = 8
 _FEWEST_ACCEPTED = 1e-3
 
 
@@ -198,28 +197,31 @@ def draw_cells(bias: Bias, scenes: int, cells: int, head: Head, generator: torch
     bias gives slightly different cells.
 
     Raises:
-        SettingError: where fewer than one draw in a thousand is reachable.
+        SettingError: where hardly any draw is reachable.
     """
-    dtype = bias.means.dtype
+    dtype, m = bias.means.dtype, bias.means.shape[1]
     logits, means, factor = (t.detach().expand(scenes, *t.shape[1:]) for t in (bias.logits, bias.means, bias.cholesky))
     edges = logits.softmax(-1).cumsum(-1)
     direction = torch.zeros(scenes, cells, 3, dtype=dtype)
-    waiting = torch.arange(scenes * cells)
-    tried = 0
-    m = logits.shape[-1]
+    waiting, tried, block = torch.arange(scenes * cells), 0, 4
+    seed = torch.randint(2**62, (), generator=generator)
     while len(waiting):
-        draws = torch.randn(_BLOCK, scenes * cells, 3, generator=generator)[:, waiting].to(dtype)
-        lot = torch.rand(_BLOCK, scenes * cells, generator=generator)[:, waiting].to(dtype)
-        scene = waiting // cells
-        component = (lot[..., None] > edges[scene]).sum(-1).clamp(max=m - 1)
-        v = means[scene, component] + (factor[scene, component] @ draws[..., None])[..., 0]
+        counter = waiting * 2**20 + torch.arange(tried, tried + block)[:, None]
+        draws = torch.stack((*_normal(seed + 2, counter, dtype), _normal(seed + 3, counter, dtype)[0]), -1)
+        if len(bias.means) == m == 1:
+            v = means[0, 0] + draws @ factor[0, 0].mT
+        else:
+            scene = (waiting // cells).expand_as(counter)
+            lot = _uniform(seed + 1, counter, dtype)[0]
+            component = (lot[..., None] > edges[scene]).sum(-1).clamp(max=m - 1)
+            v = means[scene, component] + (factor[scene, component] @ draws[..., None])[..., 0]
         unit = torch.nn.functional.normalize(v, dim=-1)
         good = reachable(head, unit)
-        tried += _BLOCK
-        first = good.to(torch.uint8).argmax(0)
-        any_good = good.any(0)
-        chosen = unit.gather(0, first[None, :, None].expand(1, -1, 3))[0]
-        direction.view(-1, 3)[waiting[any_good]] = chosen[any_good]
+        tried, block = tried + block, min(2 * block, 64)
+        order = torch.arange(len(good))[:, None]
+        first = torch.where(good, order, len(good)).amin(0)
+        any_good = first < len(good)
+        direction.view(-1, 3)[waiting[any_good]] = unit[first[any_good], any_good.nonzero()[:, 0]]
         waiting = waiting[~any_good]
         filled = 1 - len(waiting) / (scenes * cells)
         # a share s of reachable draws would have filled 1 − (1 − s)^tried by now
@@ -231,6 +233,22 @@ def draw_cells(bias: Bias, scenes: int, cells: int, head: Head, generator: torch
             "at least one draw in a thousand within the head's reach: the bias and the reachable set do not overlap",
         )
     return direction
+
+
+def _uniform(seed: Tensor, counter: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Two uniform numbers in (0, 1] for each counter: SplitMix64 (Steele, Lea, Flood 2014), any of them at any time."""
+    x = (seed * 0x632BE59BD9B4E019 + counter) * -0x61C8864680B583EB
+    x = (x ^ (x >> 30 & 0x3FFFFFFFF)) * -0x40A7B892E31B1A47
+    x = (x ^ (x >> 27 & 0x1FFFFFFFFF)) * -0x6B2FB644ECCEEE15
+    x = x ^ (x >> 31 & 0x1FFFFFFFF)
+    return ((x & 0xFFFFFFFF).to(dtype) + 0.5) / 2**32, ((x >> 32 & 0xFFFFFFFF).to(dtype) + 0.5) / 2**32
+
+
+def _normal(seed: Tensor, counter: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Two standard normal numbers for each counter (Box and Muller 1958)."""
+    u, v = _uniform(seed, counter, dtype)
+    radius, angle = (-2 * u.log()).sqrt(), 2 * math.pi * v
+    return radius * angle.cos(), radius * angle.sin()
 
 
 def log_density_each(bias: Bias, directions: Tensor) -> Tensor:

@@ -86,17 +86,20 @@ def agreement(estimate: Sample, difference: Sample, along: tuple[Tensor, Sample]
             norm.
 
     Returns:
-        `cosine` of the means (noise only lowers it); `norm_ratio`, estimate over differences, both without what noise
-        adds; its standard error `norm_ratio_error`; the reference's `norm` and its error; `snr_32_episodes`, the norm
-        over the standard deviation of an estimate of 32 episodes; and both gradients.
+        `cosine` of the means, which noise lowers, and `cosine_without_noise` (above 1 by chance); `norm_ratio`, estimate
+        over differences, both without what noise adds; its standard error `norm_ratio_error`; the reference's `norm`
+        and its error; `snr_32_episodes`, the estimate's norm over its standard deviation at 32 episodes; and both
+        gradients.
     """
     mean, reference = estimate.mean, difference.mean
+    combined = reference
     square, unit = difference.square, torch.nn.functional.normalize(reference, dim=0)
     error = difference.error_along(unit)
     if along is not None:
         unit, slope = along
-        across = difference.parts - (difference.parts @ unit)[:, None] * unit
-        square = float(slope.mean[0]) ** 2 + Sample(across).square
+        across = Sample(difference.parts - (difference.parts @ unit)[:, None] * unit)
+        square = float(slope.mean[0]) ** 2 + across.square
+        combined = slope.mean * unit + across.mean
         error = slope.error_along(torch.ones(1, dtype=torch.float64))
     norm, own = math.sqrt(square), math.sqrt(estimate.square)
     own_error = estimate.error_along(torch.nn.functional.normalize(mean, dim=0))
@@ -107,6 +110,7 @@ def agreement(estimate: Sample, difference: Sample, along: tuple[Tensor, Sample]
         spread = math.sqrt(float(estimate.parts.var(0).sum()) * estimate.episodes / 32)
     return {
         "cosine": float(torch.nn.functional.cosine_similarity(mean, reference, dim=0)),
+        "cosine_without_noise": float(mean @ combined) / (own * norm) if own > 0 and norm > 0 else math.nan,
         "norm_ratio": ratio,
         "norm_ratio_error": ratio * relative,
         "norm": norm,
