@@ -429,7 +429,8 @@ def test_the_command_keeps_its_contract(tmp_path, capsys):
     memory.cells = 30
     cells = build_cells(OmegaConf.create({"memory": memory}), HEAD, torch.Generator().manual_seed(0))
     assert cells.shape == (30, 3) and reachable(HEAD, cells).all()
-    # the full simulator takes both
+    assert OmegaConf.load(folder / "memory" / "hand.yaml").name == "hand"
+    # the full simulator takes memory and scenes
     tuned = ["memory=tuned", "scene=left_below", "scene.cans=3", "fidelity=geometric", "memory.cells=50"]
     tuned += ["sensor.receptive_fields=500", "sensor.fov_deg=90", "episodes=1", "saccades=2", "picture=false"]
     assert main(["search", "--config-dir", str(folder), *tuned, f"hydra.run.dir={tmp_path}/search"]) == 0

@@ -82,12 +82,12 @@ def build_start(cfg: DictConfig, shape: Shape) -> Tensor:
     return encode(shape, mixture, float(cfg.acquisition.alpha))
 
 
-def memory_yaml(problem: Problem, vector: Tensor, task: Tensor | None, note: str) -> str:
+def memory_yaml(problem: Problem, vector: Tensor, task: Tensor | None, note: str, name: str = "tuned") -> str:
     """A bias in the form of conf/memory/*.yaml."""
     mixture = mixture_of(problem.shape, vector.double(), task)
     covariance = mixture.cholesky @ mixture.cholesky.mT
     content = {
-        "name": "tuned",
+        "name": name,
         "cells": 20000,
         "weights": [round(v, 6) for v in mixture.logits.softmax(-1).tolist()],
         "means": [[round(v, 6) for v in row] for row in mixture.means.tolist()],
@@ -148,9 +148,10 @@ def _run(cfg: DictConfig) -> float:
     }
     if problem.shape.fov_deg is not None:
         figures["fov_deg"] = fov_of(problem.shape, state.best)
-    _write_memory(problem, state, folder)
+    _write_memory(problem, state.best, folder)
+    _write_scenes(problem.distribution, folder)
     heldout = Heldout(sizes["heldout_scenes"], whole(cfg, "heldout_seed", 0))
-    table, best = _judge(cfg, problem, start, state, heldout, figures)
+    table, best = _judge(cfg, problem, start, state, heldout, figures, folder)
     rows: list[Row] = []
     checks: list[dict[str, Any]] = []
     if cfg.study == "curves":
@@ -166,25 +167,31 @@ def _run(cfg: DictConfig) -> float:
     return best
 
 
-def _write_memory(problem: Problem, state: State, folder: Path) -> None:
-    """The result as files for `search --config-dir FOLDER memory=tuned scene=...`; a conditioned one for nine tasks."""
-    alpha = float(decode(problem.shape, state.best, torch.zeros(1, 2, dtype=torch.float64)).alpha)
-    own, observer = problem.distribution, problem.at(state.best).task.observer
+_CORNERS = [(float(a), float(e)) for a in (-1, 0, 1) for e in (-1, 0, 1)]
+
+
+def _write_memory(problem: Problem, vector: Tensor, folder: Path, name: str = "tuned", how: str = "Tuned on") -> None:
+    """A vector as files for `search --config-dir FOLDER memory=NAME`; a conditioned one for nine tasks."""
+    alpha = float(decode(problem.shape, vector, torch.zeros(1, 2, dtype=torch.float64)).alpha)
+    own, observer = problem.distribution, problem.at(vector).task.observer
     fov_deg = 2 * math.degrees(math.atan(observer.retina.radius_px / observer.camera.focal_px))
     tasks: dict[str, Tensor | None] = {"": None}
-    regions = {f"_{k}" if len(own.regions) > 1 else "": region for k, region in enumerate(own.regions)}
     if problem.shape.conditioned:
-        corners = [(a, e) for a in (-1.0, 0.0, 1.0) for e in (-1.0, 0.0, 1.0)]
-        tasks = {f"_task_{a:+.0f}_{e:+.0f}": torch.tensor([a, e]) for a, e in corners}
-        regions = {f"_task_{a:+.0f}_{e:+.0f}": own.region_of(a, e) for a, e in corners}
-    for name, task in tasks.items():
-        use = f"search --config-dir THIS_RUNS_FOLDER memory=tuned{name} scene={own.name}"
-        settings = f"acquisition.alpha={alpha:.4g} sensor.fov_deg={fov_deg:.4g}"
-        text = memory_yaml(problem, state.best, task, f"Tuned on {own.name}: torchfovea {use} {settings}")
-        with replacing(folder / "memory" / f"tuned{name}.yaml") as temporary:
-            temporary.write_text(text, encoding="utf-8")
-    for name, region in regions.items():
-        with replacing(folder / "scene" / f"{own.name}{name}.yaml") as temporary:
+        tasks = {f"_task_{a:+.0f}_{e:+.0f}": torch.tensor([a, e]) for a, e in _CORNERS}
+    for suffix, task in tasks.items():
+        use = f"search --config-dir THIS_RUNS_FOLDER memory={name}{suffix} scene={own.name}{suffix}"
+        note = f"{how} {own.name}: torchfovea {use} acquisition.alpha={alpha:.4g} sensor.fov_deg={fov_deg:.4g}"
+        with replacing(folder / "memory" / f"{name}{suffix}.yaml") as temporary:
+            temporary.write_text(memory_yaml(problem, vector, task, note, f"{name}{suffix}"), encoding="utf-8")
+
+
+def _write_scenes(own: Distribution, folder: Path) -> None:
+    """A distribution as files for `search --config-dir FOLDER scene=...`: a file for each region or task."""
+    regions = {f"_{k}" if len(own.regions) > 1 else "": region for k, region in enumerate(own.regions)}
+    if own.conditioned:
+        regions = {f"_task_{a:+.0f}_{e:+.0f}": own.region_of(a, e) for a, e in _CORNERS}
+    for suffix, region in regions.items():
+        with replacing(folder / "scene" / f"{own.name}{suffix}.yaml") as temporary:
             temporary.write_text(scene_yaml(own, region), encoding="utf-8")
 
 
@@ -206,13 +213,21 @@ def scene_yaml(distribution: Distribution, region: tuple[float, float, float, fl
 
 
 def _judge(
-    cfg: DictConfig, problem: Problem, start: Tensor, state: State, heldout: Heldout, figures: dict[str, Any]
+    cfg: DictConfig,
+    problem: Problem,
+    start: Tensor,
+    state: State,
+    heldout: Heldout,
+    figures: dict[str, Any],
+    folder: Path,
 ) -> tuple[Table, float]:
     """Every policy on the held-out scenes, and how far the tuned one is ahead of others, paired over scenes."""
     alpha, checked = float(cfg.acquisition.alpha), min(heldout.scenes, 512)
     policies = {name: (table_1(problem.shape, name, alpha), problem) for name in TABLE_1}
     policies["start"] = (start, problem)
-    policies["hand"] = (hand(problem, alpha, checked)[0], problem)
+    by_hand, sigma = hand(problem, alpha, checked)
+    policies["hand"] = (by_hand, problem)
+    _write_memory(problem, by_hand, folder, "hand", f"One Gaussian a region by hand, σ = {sigma}, for")
     policies["tuned"] = (state.best, problem)
     if cfg.prior_field:
         head, dtype = problem.task.observer.head, problem.dtype

@@ -87,9 +87,9 @@ def agreement(estimate: Sample, difference: Sample, along: tuple[Tensor, Sample]
 
     Returns:
         `cosine` of the means, which noise lowers, and `cosine_without_noise` (above 1 by chance); `norm_ratio`,
-        estimate over differences, both without what noise adds; its standard error `norm_ratio_error`; the reference's `norm`
-        and its error; `snr_32_episodes`, the estimate's norm over its standard deviation at 32 episodes; and both
-        gradients.
+        estimate over differences, both without what noise adds, and its standard error `norm_ratio_error`; the
+        reference's `norm` and its error; `snr_32_episodes`, the estimate's norm over its standard deviation at 32
+        episodes; and both gradients.
     """
     mean, reference = estimate.mean, difference.mean
     combined = reference
