@@ -359,6 +359,22 @@ def test_an_incumbent_is_not_credited_before_its_episodes_are_spent(monkeypatch)
     assert curve[2].heldout == after and curve[2].heldout_last == before
 
 
+def test_an_incumbent_out_of_reach_scores_nothing_and_a_method_that_fails_ends(monkeypatch):
+    p = problem(cells=8, saccades=3)
+    start, behind = table_1(p.shape, "top"), vector(p.shape, [-1.0, 0.0, 0.0], 1e-3)
+    monkeypatch.setitem(SEARCHES, "random", lambda *_: iter([(65, behind)]))
+    schedule = Schedule(episodes=130, validation_scenes=16, warm_episodes=0)
+    (curve,) = curves(p, start, ["random"], 1, schedule, Heldout(16, 1))
+    assert curve[-1].heldout_last == 0 and curve[-1].heldout == curve[0].heldout > 0
+
+    def failing(problem, x, batch, alpha_share):
+        raise SettingError("reachable = nothing: expected something")
+
+    monkeypatch.setitem(ESTIMATORS, "coverage", failing)
+    (curve,) = curves(p, start, ["coverage"], 1, schedule, Heldout(16, 1))
+    assert {row.heldout_last for row in curve} == {curve[0].heldout}
+
+
 def test_means_over_seeds_and_episodes_to_reach():
     mean, low, high = student([1.0, 2.0, 3.0])
     assert (mean, high - mean) == (2.0, pytest.approx(4.30 / math.sqrt(3))) and low == pytest.approx(4 - high)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from torch import Tensor
 
-from torchfovea.setting import require
+from torchfovea.setting import SettingError, require
 from torchfovea.tuning.baselines import SEARCHES
 from torchfovea.tuning.problem import Problem, evaluate
 from torchfovea.tuning.scenes import stream
@@ -103,7 +104,9 @@ def curves(
         key = (vector.numpy().tobytes(), split)
         if key not in scored:
             scenes, seed = (schedule.validation_scenes, 0) if split == "validation" else heldout
-            scored[key] = float(evaluate(problem, vector, scenes, stream(split, seed)).mean())
+            scored[key] = 0.0  # where no cell is within reach
+            with suppress(SettingError):
+                scored[key] = float(evaluate(problem, vector, scenes, stream(split, seed)).mean())
         return scored[key]
 
     budgets = budgets_up_to(schedule.episodes)
@@ -141,7 +144,8 @@ def _incumbents(
     elif warm:
         own = replace(own, warm_estimator=warm)
     seen: list[tuple[float, Tensor]] = []
-    train(problem, start, own, None, lambda state, _: seen.append((state.episodes, state.vector)))
+    with suppress(SettingError):  # one that diverges ends there
+        train(problem, start, own, None, lambda state, _: seen.append((state.episodes, state.vector)))
     yield from seen
 
 
