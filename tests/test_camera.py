@@ -78,3 +78,11 @@ def test_field_of_view_and_image_camera(kind, half):
 def test_errors_name_the_setting(call, name):
     with pytest.raises(SettingError, match=name):
         call()
+
+
+def test_a_pinholes_rays_are_linear_in_its_pixels():
+    camera = Pinhole(70.0, 3.0, -2.0)
+    px = torch.tensor([[10.0, 20.0], [-30.0, 7.0]], dtype=torch.float64)
+    turn = torch.linalg.matrix_exp(torch.tensor([[0, 0.3, 0], [-0.3, 0, 0.1], [0, -0.1, 0]], dtype=torch.float64))
+    got = torch.cat([px, torch.ones(2, 1, dtype=torch.float64)], -1) @ camera.turned(turn).mT
+    torch.testing.assert_close(got, camera.rays(px) @ turn.mT)

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from torchfovea.chart import (
     basis,
     cartesian_from_inverse_range,
+    in_tangent_frame,
     inverse_range_coordinates,
     turn_cartesian,
 )
@@ -62,6 +63,15 @@ def test_cartesian_moments_are_first_order():
         jacobian = torch.func.jacrev(point_of)(b.mean[i], direction[i])
         torch.testing.assert_close(got.mean[i], point_of(b.mean[i], direction[i]))
         torch.testing.assert_close(unpack(got.cov[i]), jacobian @ unpack(b.cov[i]) @ jacobian.T)
+
+
+def test_the_tangent_frame_is_that_of_the_basis():
+    rng = torch.Generator().manual_seed(0)
+    direction, vector = (torch.randn(50, 3, generator=rng, dtype=torch.float64) for _ in range(2))
+    direction = torch.nn.functional.normalize(direction, dim=-1)
+    got = in_tangent_frame(direction.unbind(-1), vector.unbind(-1))
+    for ours, axis in zip(got, (*basis(direction), direction), strict=True):
+        torch.testing.assert_close(ours, (axis * vector).sum(-1))
 
 
 def test_cartesian_moments_match_samples_where_noise_is_small():

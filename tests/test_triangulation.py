@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from kornia.geometry.epipolar import triangulate_points
 from scipy.optimize import least_squares
 
+from torchfovea import triangulation
 from torchfovea.camera import Fisheye, Pinhole
 from torchfovea.chart import cartesian_from_inverse_range, inverse_range_coordinates
 from torchfovea.correspondence import Correspondences
@@ -225,6 +226,69 @@ def test_batch_is_loop():
             torch.testing.assert_close(a[i], b)
 
 
+def general(monkeypatch):
+    """Make `observe` take the path through the images of the sigma points, as for any camera."""
+    monkeypatch.setattr(triangulation, "Pinhole", type(None))
+
+
+@pytest.mark.parametrize("points", [SigmaPoints(), SigmaPoints.paper(), SigmaPoints.midpoint()])
+@pytest.mark.parametrize("rotated", [True, False])
+def test_the_bilinear_form_is_the_transform_point_by_point(points, rotated, monkeypatch):
+    """Two eyes with other cameras, rolled against each other; some rays leave the view, some σ are none."""
+    every = cloud(400, 7, nearest=0.35, farthest=40.0)
+    matches, pose = stereo(every, 0.5)
+    roll = torch.linalg.matrix_exp(torch.tensor([[0, -0.1, 0.02], [0.1, 0, 0.03], [-0.02, -0.03, 0]]).double())
+    pose = pose._replace(R_right=pose.R_right @ roll, t_right=pose.t_right + 0.02)
+    other = Pinhole(83.0, 4.0, -3.0)
+    seen = other.project(to_ego(pose.R_right.mT, every - pose.t_right))
+    rng = torch.Generator().manual_seed(2)
+    spread = 0.2 + torch.rand(2, 400, generator=rng, dtype=torch.float64)
+    spread[0, :20], spread[1, 20:40] = 0.0, 300.0
+    matches = matches._replace(right_px=seen, left_sigma_px=spread[0], right_sigma_px=spread[1])
+    first, second = Pinhole(CAMERA.focal_px, 1.5, 2.5), other
+    kind = {"points": points, "rotated": rotated, "right_camera": second}
+    quick = observe(matches, pose, first, HALF, **kind)
+    general(monkeypatch)
+    slow = observe(matches, pose, first, HALF, **kind)
+    assert 0 < int((~slow.valid).sum()) < 200
+    for name, a, b in zip(slow._fields, quick, slow, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-7, atol=1e-10, msg=lambda said, name=name: f"{name}: {said}")
+
+
+def test_float32_is_as_good_by_the_bilinear_form(monkeypatch):
+    matches, pose = stereo(cloud(2000, 4), 0.1)
+    single = Correspondences(*(x.float() if x.is_floating_point() else x for x in matches))
+    rough = Eyes(*(x.float() for x in pose))
+    truth, quick = observe(matches, pose, CAMERA, HALF), observe(single, rough, CAMERA, HALF)
+    general(monkeypatch)
+    slow = observe(single, rough, CAMERA, HALF)
+    std = unpack(truth.cov).diagonal(dim1=-2, dim2=-1).sqrt()
+    for part in (0, 1):
+        error = [
+            ((seen[part].double() - truth[part]) / (std if part == 0 else truth.cov.norm(dim=-1)[:, None])).square()
+            for seen in (quick, slow)
+        ]
+        assert float(error[0].mean()) < float(error[1].mean())
+
+
+def test_pieces_are_the_whole(monkeypatch):
+    points = cloud(101, 8)
+    gazes = fixate(HEAD, points[:3])[0]
+    many = [stereo(points, 0.1, Gaze(*(g[i] for g in gazes))) for i in range(3)]
+    matches = Correspondences(*(torch.stack(pair) for pair in zip(*(m for m, _ in many), strict=True)))
+    for chart in ("inverse_range", "cartesian"):
+        whole = observe(matches, eyes(HEAD, gazes), CAMERA, HALF, chart=chart)
+        for block in (1, 40, 302):
+            with monkeypatch.context() as patch:
+                patch.setattr(triangulation, "BLOCK", block)
+                pieces = observe(matches, eyes(HEAD, gazes), CAMERA, HALF, chart=chart)
+            for a, b in zip(pieces, whole, strict=True):
+                torch.testing.assert_close(a, b)
+    none = observe(Correspondences(*(t[..., :0, :] if t.dim() == 3 else t[..., :0] for t in matches)),
+                   eyes(HEAD, gazes), CAMERA, HALF)  # fmt: skip
+    assert none.mean.shape == (3, 0, 3) and none.cov.shape == (3, 0, 6) and none.valid.shape == (3, 0)
+
+
 @pytest.mark.parametrize("chart", ["inverse_range", "cartesian"])
 def test_gradients(chart):
     matches, pose = stereo(cloud(3, 1, farthest=1.5), 0.1)
@@ -236,6 +300,10 @@ def test_gradients(chart):
         return o.mean, o.cov
 
     inputs = (matches.left_px, matches.right_px, matches.left_sigma_px)
+    assert torch.autograd.gradcheck(
+        lambda *poses: observe(matches, Eyes(*poses), CAMERA, HALF, chart=chart)[:2],
+        tuple(x.detach().clone().requires_grad_() for x in pose),
+    )
     assert torch.autograd.gradcheck(through, tuple(x.detach().clone().contiguous().requires_grad_() for x in inputs))
 
 

@@ -8,9 +8,9 @@ from filterpy.kalman import unscented_transform as filterpy_transform
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchfovea.gaussian import columns
+from torchfovea.gaussian import columns, pack, positive_definite
 from torchfovea.setting import SettingError
-from torchfovea.unscented import SigmaPoints, unscented_transform
+from torchfovea.unscented import SigmaPoints, definiteness, unscented_transform
 
 CHOICES = [SigmaPoints(), SigmaPoints.paper()]
 
@@ -88,3 +88,18 @@ def test_errors_name_the_setting():
         SigmaPoints(alpha=0)
     with pytest.raises(SettingError, match=r"sigma_points.dimensions = 4: expected 2"):
         unscented_transform(lambda x: x, torch.zeros(1, 2), torch.eye(2)[None], SigmaPoints())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_definiteness_is_positive_where_positive_definite(dtype):
+    rng = torch.Generator().manual_seed(0)
+    factor = torch.randn(4000, 3, 4, generator=rng, dtype=torch.float64)
+    sign = torch.where(torch.rand(4000, 1, 4, generator=rng) < 0.1, -1.0, 1.0)
+    size = 10.0 ** torch.randint(-5, 3, (4000, 3, 1), generator=rng)
+    cov = pack(((factor * sign) @ factor.mT * size * size.mT).to(dtype))
+    for k, value in enumerate((0.0, -1.0, torch.inf, torch.nan)):
+        for entry in range(6):
+            cov[6 * k + entry, entry] = value
+    want = positive_definite(cov)
+    assert 100 < int(want.sum()) < 3900
+    assert torch.equal(definiteness(cov.unbind(-1)) > 0, want)

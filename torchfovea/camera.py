@@ -52,6 +52,11 @@ class Pinhole:
         x, y = ((c - centre if centre else c) * (1 / self.focal_px) for c, centre in ((u, self.cx_px), (v, self.cy_px)))
         return x, y, u.new_ones(())
 
+    def turned(self, rotation: Tensor) -> Tensor:
+        """R K⁻¹ (..., 3, 3), which takes pixels (u, v, 1) to rays turned by R (..., 3, 3). Differentiable."""
+        x, y, z = (rotation / rotation.new_tensor([self.focal_px, self.focal_px, 1.0])).unbind(-1)
+        return torch.stack([x, y, z - self.cx_px * x - self.cy_px * y], -1)
+
     def project(self, direction: Tensor) -> Tensor:
         """Pixels of directions, (..., 3) to (..., 2); finite, and meaningless where `in_view` is false.
 

@@ -12,17 +12,25 @@ there, and averaging is unbiased only if it is kept.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from torchfovea.gaussian import Gaussian, columns
+from torchfovea.unscented import SigmaPoints, moments_of_differences
 
 __all__ = [
+    "Components",
     "basis",
+    "bilinear_moments",
     "cartesian_from_inverse_range",
+    "in_tangent_frame",
     "inverse_range_coordinates",
     "turn_cartesian",
 ]
+
+Components = Sequence[Tensor]  # of vectors, each (...)
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
@@ -40,10 +48,34 @@ def basis(direction: Tensor) -> tuple[Tensor, Tensor]:
         Duff et al. (2017), Building an orthonormal basis, revisited.
     """
     x, y, z = direction.unbind(-1)
-    sign = torch.where(z < 0, -torch.ones_like(z), torch.ones_like(z))
+    sign = torch.copysign(z.new_ones(()), z)
     a = -1 / (sign + z)
     b = x * y * a
     return columns(1 + sign * x * x * a, sign * b, -sign * x), columns(b, sign + y * y * a, -y)
+
+
+def in_tangent_frame(direction: Components, vector: Components) -> tuple[Tensor, Tensor, Tensor]:
+    """Coordinates of vectors along e₁, e₂ and n of `basis`, without forming it.
+
+    With s the sign of z and t = (x v₁ + y v₂)/(s + z) + v₃: e₁·v = v₁ − s x t and e₂·v = s v₂ − y t.
+
+    Args:
+        direction: unit n, three components (x, y, z) broadcastable to (...).
+        vector: three components (...) in the frame of n.
+
+    Returns:
+        Three components (...). Differentiable but on the equator.
+    """
+    x, y, z = direction
+    first, second, third = vector
+    sign = torch.copysign(z.new_ones(()), z)
+    level = (x * first).addcmul_(y, second)
+    t = torch.addcmul(third, (sign + z).reciprocal(), level)
+    return (
+        torch.addcmul(first, sign * x, t, value=-1),
+        (sign * second).addcmul_(y, t, value=-1),
+        torch.addcmul(level, z, third),
+    )
 
 
 def inverse_range_coordinates(
@@ -67,6 +99,56 @@ def inverse_range_coordinates(
         _dot(e2, homogeneous) * ahead,
         weight * _dot(homogeneous, homogeneous).rsqrt(),
     )
+
+
+def bilinear_moments(
+    centre: Tensor,
+    by_left: Tensor,
+    by_right: Tensor,
+    by_both: Tensor,
+    alpha: Tensor,
+    beta: Tensor,
+    points: SigmaPoints,
+) -> tuple[list[Tensor], list[Tensor], Tensor]:
+    """The unscented transform of a bilinear h(p, q) = (X, w), in inverse range, without forming the sigma points.
+
+    A column of the root moves p and q along one axis i of both, by α and β. The form takes that, for either sign, to
+
+        h(p ± α i, q ± β i) = h(p, q) ± (α h(i, q) + β h(p, i)) + α β h(i, i).
+
+    In the tangent frame of X at the centre, with its length as the unit, the images are X = (a, b, n) and their
+    coordinates a/n, b/n and w/|X|; what they share is turned into that frame once.
+
+    Args:
+        centre: h(p, q), (4, ..., N).
+        by_left: h(i, q) for both axes, (4, 2, ..., N).
+        by_right: h(p, i).
+        by_both: h(i, i), (4, 2, ..., 1).
+        alpha: of both columns, (2, ..., N), standard deviations.
+        beta: the same for q.
+        points: sigma points of the four dimensions.
+
+    Returns:
+        Mean and covariance by components, as `torchfovea.unscented.moments`, about the direction of the central image
+        (3, ..., N). Differentiable.
+    """
+    length = (centre[:3] * centre[:3]).sum(0).sqrt_()
+    *direction, rho = (unit := centre / length).unbind(0)
+    scale = points.spread / length
+    twice = (alpha * beta * (points.spread * scale)).unsqueeze(1)
+    alpha, beta = (alpha * scale).unsqueeze(1), (beta * scale).unsqueeze(1)
+    one, signs = rho.new_ones(()), rho.new_tensor([1.0, -1.0]).reshape(-1, *[1] * alpha.dim())
+    forms = [h.unbind(0) for h in (by_left, by_right, by_both)]
+    parts = zip(*((*in_tangent_frame(direction, h[:3]), h[3]) for h in forms), strict=True)
+    image = []
+    for start, (p, q, both) in zip((None, None, one, rho), parts, strict=True):
+        even = twice * both if start is None else torch.addcmul(start, twice, both)
+        image.append(torch.addcmul(even, signs, (alpha * p).addcmul_(beta, q)).flatten(0, 2))
+    a, b, n, w = image
+    off = w / (a * a).addcmul_(b, b).addcmul_(n, n).sqrt_() - rho
+    nearer = n.reciprocal()
+    shift, second = moments_of_differences((a * nearer, b * nearer, off), points)
+    return [shift[0], shift[1], rho + shift[2]], second, unit[:3]
 
 
 def cartesian_from_inverse_range(belief: Gaussian, direction: Tensor, far_m: float = 1000.0) -> Gaussian:

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchfovea.camera import Camera
-from torchfovea.chart import basis
+from torchfovea.camera import Camera, Pinhole
+from torchfovea.chart import Components, bilinear_moments, in_tangent_frame
 from torchfovea.correspondence import Correspondences
-from torchfovea.gaussian import columns, positive_definite
+from torchfovea.gaussian import columns
 from torchfovea.head import Eyes
 from torchfovea.head import to_ego as turn
 from torchfovea.setting import require
-from torchfovea.unscented import SigmaPoints, moments, sigma_components
+from torchfovea.unscented import SigmaPoints, definiteness, eye_root, moments, root_rows, sigma_components, sigma_root
 
 __all__ = ["Observations", "observe", "rig_frame", "sigma_root", "triangulate", "triangulate_rectified"]
 
-BLOCK = 8192
-Components = tuple[Tensor, ...]
+BLOCK = 16384  # receptive fields at once on a CPU, so that intermediate results stay in its cache
 
 
 class Observations(NamedTuple):
@@ -38,10 +38,6 @@ class Observations(NamedTuple):
     direction: Tensor
     support_rad: Tensor
     valid: Tensor
-
-
-def _dot(a: Components, b: Components) -> Tensor:
-    return torch.addcmul(torch.addcmul(a[0] * b[0], a[1], b[1]), a[2], b[2])
 
 
 def _turned(rotation: Tensor, vector: Components) -> Components:
@@ -155,41 +151,16 @@ def rig_frame(eyes: Eyes) -> tuple[Tensor, Tensor, Tensor]:
     return torch.stack([x, torch.linalg.cross(z, x), z], -1), (eyes.t_left + eyes.t_right) / 2, baseline
 
 
-def sigma_root(left_sigma: Tensor, right_sigma: Tensor, rotated: bool = True) -> Tensor:
-    """A square root of Σ = diag(σₗ², σₗ², σᵣ², σᵣ²) over (uₗ, vₗ, uᵣ, vᵣ) (Eq. 7).
+class _Rig(NamedTuple):
+    """The rig's frame, origin and baseline (see `rig_frame`), the eyes' rotations into that frame and their cameras."""
 
-    Args:
-        left_sigma: (...) [px].
-        right_sigma: (...) [px].
-        rotated: turn the root so that its columns are disparity and version, horizontal and vertical: the version
-            columns move both eyes alike and leave the disparity alone, so that the whole curvature of triangulation
-            lies along one axis, where the sigma points integrate it. False: the diagonal (Cholesky) root.
-
-    Returns:
-        (..., 4, 4), Σ = root rootᵀ. Differentiable.
-    """
-    zero = torch.zeros_like(left_sigma)
-    rows = _root_rows(left_sigma, right_sigma, rotated)
-    return columns(*(zero if entry is None else entry for row in rows for entry in row)).unflatten(-1, (4, 4))
-
-
-def _root_rows(left: Tensor, right: Tensor, rotated: bool) -> list[list[Tensor | None]]:
-    """The rows of `sigma_root`, None for zero."""
-    if not rotated:
-        return [
-            [left, None, None, None],
-            [None, left, None, None],
-            [None, None, right, None],
-            [None, None, None, right],
-        ]
-    scale = (left * left + right * right).rsqrt()
-    there, back, both = left * left * scale, -(right * right) * scale, left * right * scale
-    return [
-        [there, both, None, None],
-        [None, None, there, both],
-        [back, both, None, None],
-        [None, None, back, both],
-    ]
+    frame: Tensor
+    origin: Tensor
+    baseline: Tensor
+    left: Tensor
+    right: Tensor
+    left_camera: Camera
+    right_camera: Camera
 
 
 def observe(
@@ -227,74 +198,122 @@ def observe(
     """
     require(chart in ("inverse_range", "cartesian"), "chart", chart, "inverse_range or cartesian")
     points = points or (SigmaPoints.midpoint() if chart == "cartesian" else SigmaPoints())
-    count = matches.valid.shape[-1]
-    learning = torch.is_grad_enabled() and any(t.requires_grad for t in (*matches[:4], *eyes))
-    if count <= BLOCK or learning or not matches.valid.device.type == "cpu":
-        return _observe(matches, eyes, camera, support_px, points, chart, rotated, right_camera or camera)
-    # nine sigma points of a few thousand receptive fields stay in the processor's cache; of all of them they do not
-    axes = (-2, -2, -1, -1, -1)
-    parts = []
-    for start in range(0, count, BLOCK):
-        size = min(BLOCK, count - start)
-        part = Correspondences(*(t.narrow(axis, start, size) for t, axis in zip(matches, axes, strict=True)))
-        support = support_px.narrow(-1, start, size)
-        parts.append(_observe(part, eyes, camera, support, points, chart, rotated, right_camera or camera))
-    means, covs, directions, supports, valids = zip(*parts, strict=True)
-    return Observations(_join(means), _join(covs), _join(directions), torch.cat(supports, -1), torch.cat(valids, -1))
-
-
-def _join(parts: tuple[Tensor, ...]) -> Tensor:
-    """Join (..., n, k) along n, each component contiguous as `columns` makes it."""
-    return torch.cat([part.movedim(-1, 0) for part in parts], -1).movedim(0, -1)
-
-
-def _observe(
-    matches: Correspondences,
-    eyes: Eyes,
-    camera: Camera,
-    support_px: Tensor,
-    points: SigmaPoints,
-    chart: str,
-    rotated: bool,
-    right_camera: Camera,
-) -> Observations:
+    batch, count = matches.valid.shape[:-1], matches.valid.shape[-1]
+    eyes = Eyes(*(part.expand(*batch, *part.shape[-k:]) for part, k in zip(eyes, (2, 1, 2, 1), strict=True)))
     frame, origin, baseline = rig_frame(eyes)
-    root = _root_rows(matches.left_sigma_px, matches.right_sigma_px, rotated)
+    cameras = camera, right_camera or camera
+    rig = _Rig(frame, origin, baseline, frame.mT @ eyes.R_left, frame.mT @ eyes.R_right, *cameras)
+    transform = partial(_transform, rig=rig, points=points, chart=chart, rotated=rotated)
+    if chart == "inverse_range" and isinstance(cameras[0], Pinhole) and isinstance(cameras[1], Pinhole):
+        transform = partial(_transform_form, form=_form(rig, cameras[0], cameras[1]), points=points, rotated=rotated)
+    size = count
+    learning = torch.is_grad_enabled() and any(t.requires_grad for t in (*matches[:4], *eyes))
+    if matches.valid.device.type == "cpu" and not learning:
+        size = -(-count // max(1, round(matches.valid.numel() / BLOCK)))
+    parts = []
+    for start in range(0, max(count, 1), max(size, 1)):
+        axes = zip(matches, (-2, -2, -1, -1, -1), strict=True)
+        part = Correspondences(*(t.narrow(axis, start, min(size, count - start)) for t, axis in axes))
+        parts.append(_settled(part, *transform(part)))
+    value, direction, valid = (p[0] if len(p) == 1 else torch.cat(p, -1) for p in zip(*parts, strict=True))
+    x, y, z = camera.ray_components(*matches.left_px.unbind(-1))
+    support = support_px / camera.focal_px * torch.addcmul(torch.addcmul(z * z, x, x), y, y).rsqrt()
+    mean, cov = value[:3].movedim(0, -1), value[3:].movedim(0, -1)
+    return Observations(mean, cov, direction.movedim(0, -1), support.expand(valid.shape), valid)
+
+
+# of the images of the sigma points: mean and covariance by components, the direction of the central one (3, ..., N),
+# and a number that is positive where all of them are in front
+_Moments = tuple[list[Tensor], list[Tensor], Tensor, Tensor]
+
+
+def _transform(matches: Correspondences, rig: _Rig, points: SigmaPoints, chart: str, rotated: bool) -> _Moments:
+    """The transform point by point (Eq. 10-18), for any camera and chart."""
+    root = root_rows(matches.left_sigma_px, matches.right_sigma_px, rotated)
     places = sigma_components((*matches.left_px.unbind(-1), *matches.right_px.unbind(-1)), root, points)
-    left = _turned(frame.mT @ eyes.R_left, camera.ray_components(*places[:2]))
-    right = _turned(frame.mT @ eyes.R_right, right_camera.ray_components(*places[2:]))
+    left = _turned(rig.left, rig.left_camera.ray_components(*places[:2]))
+    right = _turned(rig.right, rig.right_camera.ray_components(*places[2:]))
     if chart == "cartesian":
-        half = torch.stack([baseline / 2, torch.zeros_like(baseline), torch.zeros_like(baseline)], -1).unsqueeze(-2)
+        zero = torch.zeros_like(rig.baseline)
+        half = torch.stack([rig.baseline / 2, zero, zero], -1).unsqueeze(-2)
         point, both = triangulate(columns(*left), columns(*right), -half, half)
-        in_front = both.all(0)
-        point = turn(frame, point) + origin.unsqueeze(-2)
+        point = turn(rig.frame, point) + rig.origin.unsqueeze(-2)
         direction = point[0] * (point[0] * point[0]).sum(-1, keepdim=True).rsqrt()
-        first, second = moments(point.unbind(-1), points)
-    else:
-        x, w, least = _rectified(left, right)
-        in_front = least.amin(0) > 0
-        w = w * (2 / baseline.unsqueeze(-1))
-        # the origin of E joins in the rig's axes: the few directions come to the sigma points, not these to E
-        shift = turn(frame.mT, origin.unsqueeze(-2)).unbind(-1)
-        x = tuple(torch.addcmul(c, w, s) for c, s in zip(x, shift, strict=True))
-        ahead = columns(*(c[0] for c in x))
-        ahead = ahead * (ahead * ahead).sum(-1, keepdim=True).rsqrt()
-        direction = turn(frame, ahead)
-        tangents = [turn(frame.mT, e).unbind(-1) for e in basis(direction)]
-        # (a, b, ρ) of `torchfovea.chart`, by components
-        depth = 1 / _dot(ahead.unbind(-1), x)
-        offsets = [_dot(e, x) * depth for e in tangents]
-        first, second = moments((*offsets, w * _dot(x, x).rsqrt()), points)
-    value, cov = columns(*first), columns(*second)
-    sure = torch.minimum(matches.left_sigma_px, matches.right_sigma_px) > 0
-    valid = matches.valid & sure & in_front & positive_definite(cov) & torch.isfinite(value).all(-1)
-    safe = columns(*(torch.full_like(valid, float(k in (0, 3, 5)), dtype=cov.dtype) for k in range(6)))
-    centre = camera.rays(matches.left_px)
-    support = support_px / camera.focal_px * (centre * centre).sum(-1).rsqrt()
-    return Observations(
-        torch.where(valid[..., None], value, torch.ones_like(value)),
-        torch.where(valid[..., None], cov, safe),
-        direction,
-        support.expand(valid.shape),
-        valid,
-    )
+        return *moments(point.unbind(-1), points), direction.movedim(-1, 0), both.all(0).to(direction.dtype)
+    x, w, least = _rectified(left, right)
+    x = _placed(rig, x, w := w * (2 / rig.baseline.unsqueeze(-1)))
+    direction = torch.stack([c[0] for c in x])
+    direction = direction * (direction * direction).sum(0).rsqrt()
+    a, b, ahead = in_tangent_frame(direction.unbind(0), x)
+    rho = w * torch.addcmul(torch.addcmul(x[0] * x[0], x[1], x[1]), x[2], x[2]).rsqrt()
+    return *moments((a / ahead, b / ahead, rho), points), direction, least.amin(0)
+
+
+def _placed(rig: _Rig, x: Components, w: Tensor) -> Components:
+    """Homogeneous points from the rig's frame to E: R X + w t."""
+    origin = rig.origin.unsqueeze(-1).unbind(-2)
+    return tuple(torch.addcmul(c, w, o) for c, o in zip(_turned(rig.frame, x), origin, strict=True))
+
+
+class _Form(NamedTuple):
+    """Triangulation with pinhole eyes, whose rays are linear in (u, v, 1): a bilinear form of the two places.
+
+    Attributes:
+        point: coefficients, the homogeneous points (X, w) in E between the rays of the places' axes, (4, 3, 3, ..., 1).
+        left: coefficients of the left ray's depth in the rig's frame, (3, ..., 1).
+        right: of the right one's.
+    """
+
+    point: Tensor
+    left: Tensor
+    right: Tensor
+
+
+def _form(rig: _Rig, left_camera: Pinhole, right_camera: Pinhole) -> _Form:
+    left, right = left_camera.turned(rig.left), right_camera.turned(rig.right)
+    x, w, _ = _rectified(left.unsqueeze(-1).unbind(-3), right.unsqueeze(-2).unbind(-3))
+    w = (w * (2 / rig.baseline[..., None, None])).flatten(-2)
+    point = torch.stack([*_placed(rig, tuple(c.flatten(-2) for c in x), w), w])
+    point = point.unflatten(-1, (3, 3)).movedim((-2, -1), (1, 2)).unsqueeze(-1)
+    return _Form(point, *(ray[..., 2, :].movedim(-1, 0).unsqueeze(-1) for ray in (left, right)))
+
+
+def _affine(coefficients: Tensor | Components, u: Tensor, v: Tensor) -> Tensor:
+    return (coefficients[0] * u).addcmul_(coefficients[1], v).add_(coefficients[2])
+
+
+def _transform_form(matches: Correspondences, form: _Form, points: SigmaPoints, rotated: bool) -> _Moments:
+    """The same for pinhole eyes in inverse range, without forming the sigma points: see `bilinear_moments`.
+
+    The form is linear in either place, so that the place's axes u and v move the point by multiples of the form there.
+    """
+    (u, v), (there_u, there_v) = matches.left_px.unbind(-1), matches.right_px.unbind(-1)
+    by_left = _affine(form.point.unbind(2), there_u, there_v)
+    by_right = _affine(form.point[:, :, :2].unbind(1), u, v)
+    by_both = torch.stack([form.point[:, 0, 0], form.point[:, 1, 1]], 1)
+    centre = torch.addcmul(by_left[:, 2], by_left[:, 0], u).addcmul_(by_left[:, 1], v)
+    root = eye_root(matches.left_sigma_px, matches.right_sigma_px, rotated)
+    # the depth of the ray nearest to the side: no column moves it by more than the larger of its two parts
+    depths = [
+        _affine(z, *place).sub_(z[:2].abs().amax(0) * eye.abs().amax(0), alpha=points.spread)
+        for z, place, eye in ((form.left, (u, v), root[0]), (form.right, (there_u, there_v), root[1]))
+    ]
+    return *bilinear_moments(centre, by_left[:, :2], by_right, by_both, *root, points), torch.minimum(*depths)
+
+
+def _settled(
+    matches: Correspondences, first: list[Tensor], second: list[Tensor], direction: Tensor, ahead: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean and covariance (9, ..., N), of unit size where not valid; the direction; and what is valid.
+
+    One number is positive where all conditions hold, and not a number where anything is not finite: comparing once is
+    faster than joining bools.
+    """
+    with torch.no_grad():
+        sure = torch.minimum(matches.left_sigma_px, matches.right_sigma_px)
+        keep = torch.minimum(torch.minimum(ahead, sure), definiteness(second))
+        keep = (keep > 0) & matches.valid
+        gone = 1 - keep.to(ahead.dtype)
+    value = torch.stack([*first, *second])
+    unit = value.new_tensor([1.0, 1, 1, 1, 0, 0, 1, 0, 1]).reshape(-1, *[1] * gone.dim())
+    return torch.addcmul((value * (1 - gone)).nan_to_num(0.0, 0.0, 0.0), unit, gone), direction, keep

@@ -17,7 +17,17 @@ from torch import Tensor
 from torchfovea.gaussian import columns
 from torchfovea.setting import require
 
-__all__ = ["SigmaPoints", "moments", "sigma_components", "unscented_transform"]
+__all__ = [
+    "SigmaPoints",
+    "definiteness",
+    "eye_root",
+    "moments",
+    "moments_of_differences",
+    "root_rows",
+    "sigma_components",
+    "sigma_root",
+    "unscented_transform",
+]
 
 
 @dataclass(frozen=True)
@@ -141,15 +151,66 @@ def moments(image: Sequence[Tensor], points: SigmaPoints) -> tuple[list[Tensor],
         m components of the mean and m(m+1)/2 of the covariance's upper triangle, row by row, each (...).
         Differentiable.
     """
+    shift, second = moments_of_differences([component[1:] - component[0] for component in image], points)
+    return [component[0] + s for component, s in zip(image, shift, strict=True)], second
+
+
+def moments_of_differences(delta: Sequence[Tensor], points: SigmaPoints) -> tuple[list[Tensor], list[Tensor]]:
+    """`moments` from the differences δ to the central image, m components (2n, ...); the mean less that image."""
     # δ₀ = 0 and the other weights are all one w (Eq. 16), for mean and covariance alike: with s = w Σ δ,
     # Σ w (δ − s)(δ − s)ᵀ = w Σ δ δᵀ + (Σ w_c − 2) s sᵀ, the sum of the weights including the centre's
     weights_mean, weights_cov = points.weights
     weight, rest = weights_mean[1], sum(weights_cov) - 2
-    delta = [component[1:] - component[0] for component in image]
-    shift = [weight * component.sum(0) for component in delta]
+    shift = [component.sum(0) * weight for component in delta]
     second = [
-        torch.addcmul(weight * (delta[i] * delta[j]).sum(0), shift[i], shift[j], value=rest)
+        ((delta[i] * delta[j]).sum(0) * weight).addcmul_(shift[i], shift[j], value=rest)
         for i in range(len(delta))
         for j in range(i, len(delta))
     ]
-    return [component[0] + s for component, s in zip(image, shift, strict=True)], second
+    return shift, second
+
+
+def definiteness(cov: Sequence[Tensor]) -> Tensor:
+    """Positive where `torchfovea.gaussian.positive_definite`, by components, (...); elsewhere not, or not a number."""
+    xx, xy, xz, yy, yz, zz = cov
+    sx, sy, sz = xx.rsqrt(), yy.rsqrt(), zz.rsqrt()
+    xy, xz, yz = xy * sx * sy, xz * sx * sz, yz * sy * sz
+    minor, other, rest = 1 - xy * xy, 1 - xz * xz, yz - xy * xz
+    least = torch.minimum(minor, minor * other - rest * rest) - max(8 * torch.finfo(xx.dtype).eps, 1e-13)
+    return torch.add(least, xx + yy + zz, alpha=0)
+
+
+def sigma_root(left_sigma: Tensor, right_sigma: Tensor, rotated: bool = True) -> Tensor:
+    """A square root of Σ = diag(σₗ², σₗ², σᵣ², σᵣ²) over (uₗ, vₗ, uᵣ, vᵣ) (Eq. 7).
+
+    Args:
+        left_sigma: (...) [px].
+        right_sigma: (...) [px].
+        rotated: turn the root so that its columns are disparity and version, horizontal and vertical: the version
+            columns move both eyes alike and leave the disparity alone, so that the whole curvature of triangulation
+            lies along one axis, where the sigma points integrate it. False: the diagonal (Cholesky) root.
+
+    Returns:
+        (..., 4, 4), Σ = root rootᵀ. Differentiable.
+    """
+    zero = torch.zeros_like(left_sigma)
+    rows = root_rows(left_sigma, right_sigma, rotated)
+    return columns(*(zero if entry is None else entry for row in rows for entry in row)).unflatten(-1, (4, 4))
+
+
+def eye_root(left: Tensor, right: Tensor, rotated: bool) -> tuple[Tensor, Tensor]:
+    """A square root of diag(σₗ², σᵣ²), for one axis of the retinas: a row for each eye, columns first (2, ...)."""
+    if not rotated:
+        zero = torch.zeros_like(left)
+        return torch.stack([left, zero]), torch.stack([zero, right])
+    scale = (left * left + right * right).rsqrt()
+    both = left * right * scale
+    return torch.stack([left * left * scale, both]), torch.stack([-(right * right) * scale, both])
+
+
+def root_rows(left: Tensor, right: Tensor, rotated: bool) -> list[list[Tensor | None]]:
+    """The rows of `sigma_root`, None for zero."""
+    (a, b), (c, d) = eye_root(left, right, rotated)
+    if rotated:
+        return [[a, b, None, None], [None, None, a, b], [c, d, None, None], [None, None, c, d]]
+    return [[a, None, None, None], [None, a, None, None], [None, None, d, None], [None, None, None, d]]
