@@ -5,6 +5,7 @@ import dataclasses
 import json
 import math
 import time
+from functools import partial
 
 import numpy as np
 import pytest
@@ -20,6 +21,8 @@ from torchfovea.experiments import bench
 from torchfovea.head import fixate
 from torchfovea.layout import LogPolar
 from torchfovea.perception import Observer
+from torchfovea.setting import SettingError
+from torchfovea.strategies import expected_improvement, upper_confidence_bound
 
 FULL = Observer(retina=LogPolar(1500))
 PLAIN = dataclasses.replace(FULL, fusion=Fusion(fill=False, conflict=math.inf))
@@ -54,6 +57,19 @@ def test_ours_and_every_peer_compute_the_same(look):
         "triangulate_ut", "align", "fuse", "fuse", "decide", "step", "step", "step", "retina", "retina"
     ]  # fmt: skip
     assert all(path.moved > 0 for path in made)
+
+
+@pytest.mark.parametrize("alpha", [0.0, 2.0, 1000.0])
+def test_the_peers_decide_by_the_observers_alpha(look, alpha):
+    bold = dataclasses.replace(PLAIN, acquisition=partial(upper_confidence_bound, alpha=alpha))
+    for path in steps.paths_of_steps(look._replace(observer=bold), FULL):
+        path.check()
+
+
+def test_peers_know_the_upper_confidence_bound_only(look):
+    other = dataclasses.replace(PLAIN, acquisition=expected_improvement)
+    with pytest.raises(SettingError, match="expected ucb, in bench"):
+        steps.paths_of_steps(look._replace(observer=other), FULL)[0].check()
 
 
 def _wrong(result):

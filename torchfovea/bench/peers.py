@@ -204,8 +204,9 @@ def decide(
     head: Head,
     prior: tuple[float, float],
     limits: tuple[float, float],
+    alpha: float,
 ) -> Choice:
-    """Reward, upper confidence bound with α = 1 and the next fixation, in NumPy.
+    """Reward, upper confidence bound and the next fixation, in NumPy.
 
     Args:
         cells: directions (Nx, 3).
@@ -216,6 +217,7 @@ def decide(
         head: its limits.
         prior: mean and standard deviation of an unseen cell's inverse range.
         limits: nearest range, and the height below which all is ground [m].
+        alpha: of the upper confidence bound.
     """
     cov = np.linalg.inv(matrix)
     moments = (cov @ vector[..., None])[..., 0]
@@ -228,7 +230,7 @@ def decide(
     spread = spread + along[:, None, None] * cells[:, :, None] * cells[:, None]
     ground = seen & (points[:, 2] + head.ego_height_m < limits[1])
     eligible = _reachable(points, head) & (range_m > limits[0]) & ~ground
-    score = np.where(eligible, rho + std, -np.inf)
+    score = np.where(eligible, rho + alpha * std, -np.inf)
     return Choice(int(score.argmax()), score, points, spread, rho, std)
 
 
@@ -250,6 +252,7 @@ def step(
     head: Head,
     prior: tuple[float, float],
     limits: tuple[float, float],
+    alpha: float,
 ) -> Choice:
     """A whole step in NumPy and SciPy: correspondences in, the next fixation out.
 
@@ -271,6 +274,7 @@ def step(
         head: see `decide`.
         prior: see `decide`.
         limits: see `decide`.
+        alpha: see `decide`.
     """
     found = unscented(np, px, sigma, rig, points)
     chord, cell = tree.query(found.direction, workers=2)
@@ -288,4 +292,4 @@ def step(
     vector = vector + add @ (weighted * found.mean[keep, 2:])
     bearing = bearing + add @ (2 / across)
     cells = np.ascontiguousarray(frames[..., 2])
-    return decide(cells, vector, matrix, bearing, add @ ones > 0, head, prior, limits)
+    return decide(cells, vector, matrix, bearing, add @ ones > 0, head, prior, limits, alpha)

@@ -15,6 +15,8 @@ from torchfovea.bench.look import Saccade, batch_of, flat_of, moved_to, part_of,
 from torchfovea.bench.timing import Growth, Path, Peer, nbytes, same
 from torchfovea.gaussian import columns, unpack
 from torchfovea.perception import Mind, Observer, decide, new_mind, perceive
+from torchfovea.setting import require
+from torchfovea.strategies import upper_confidence_bound
 from torchfovea.triangulation import observe
 from torchfovea.unscented import SigmaPoints
 
@@ -30,6 +32,14 @@ def _known(mind: Mind) -> tuple[Any, ...]:
 
 def _limits(observer: Observer) -> tuple[float, float]:
     return observer.eligibility.nearest_m, observer.eligibility.ground_z_m
+
+
+def _alpha(observer: Observer) -> float:
+    """Of the observer's upper confidence bound, which the peers compute too."""
+    strategy = observer.acquisition
+    known = isinstance(strategy, partial) and strategy.func is upper_confidence_bound and not strategy.args
+    require(known, "acquisition", getattr(strategy, "func", strategy), "ucb, in bench")
+    return float(strategy.keywords.get("alpha", 1.0)) if isinstance(strategy, partial) else 1.0
 
 
 def _same_choice(what: str, ours: Any, theirs: peers.Choice, share: float) -> None:
@@ -50,7 +60,7 @@ def _decide(look: Saccade) -> Path:
     ours = partial(decide, observer, mind)
 
     def theirs() -> peers.Choice:
-        return peers.decide(cells, vector, matrix, bearing, seen, observer.head, prior, limits)
+        return peers.decide(cells, vector, matrix, bearing, seen, observer.head, prior, limits, _alpha(observer))
 
     def check() -> None:
         _same_choice("decide", ours(), theirs(), 0.999)
@@ -95,6 +105,7 @@ def _step(look: Saccade, full: Observer) -> list[Path]:
         peers.step, px, sigma, support, look.matches.valid.cpu().numpy(), rig, SigmaPoints(), cKDTree(cells),
         peers.tangent_frames(np, cells), mind.spacing_rad.cpu().numpy(), gates, vector, matrix, bearing,
         observer.prior.slope_std, observer.head, (observer.prior.mean, observer.prior.std), _limits(observer),
+        _alpha(observer),
     )  # fmt: skip
     ours = partial(_one_step, look)
 
