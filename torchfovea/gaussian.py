@@ -99,14 +99,11 @@ def positive_definite(sym: Tensor, tolerance: float | None = None) -> Tensor:
     """
     if tolerance is None:
         tolerance = max(8 * torch.finfo(sym.dtype).eps, 1e-13)
-    xx, xy, xz, yy, yz, zz = sym.unbind(-1)
-    diagonal = (xx > 0) & (yy > 0) & (zz > 0) & torch.isfinite(xx + yy + zz)
-    one = torch.ones((), dtype=sym.dtype, device=sym.device)
-    sx, sy, sz = (torch.where(diagonal, d, one).rsqrt() for d in (xx, yy, zz))
+    xx, xy, xz, yy, yz, zz = sym.detach().unbind(-1)
+    sx, sy, sz = xx.rsqrt(), yy.rsqrt(), zz.rsqrt()  # NaN, which no comparison passes, for what is not positive
     xy, xz, yz = xy * sx * sy, xz * sx * sz, yz * sy * sz
-    minor = 1 - xy * xy
     det = 1 - yz * yz - xy * (xy - xz * yz) - xz * (xz - xy * yz)
-    return diagonal & (minor > tolerance) & (det > tolerance)
+    return (torch.minimum(1 - xy * xy, det) > tolerance) & (xx + yy + zz < torch.inf)
 
 
 def times3(sym: Tensor, vector: Tensor) -> Tensor:
