@@ -121,6 +121,22 @@ def test_same_seed_same_episodes():
     assert not torch.equal(first.value, play(p, x, p.batch(5, stream("training", 4))).value)
 
 
+def test_without_strictness_cells_out_of_reach_are_missing_and_the_others_as_before():
+    p = problem(cells=12, saccades=4, distribution=Distribution(cans=3, conditioned=True), conditioned=True)
+    x = vector(p.shape)
+    lost = x.clone()
+    lost[9], lost[10:12], lost[3:6], lost[12:15] = -2.0, 0.0, -2.0, 0.0  # the task's azimuth turns the mean back
+    batch = p.batch(40, stream("training", 0))
+    with pytest.raises(SettingError, match="do not overlap"):
+        play(p, lost, batch)
+    world = prepare(p, p.bias(lost, batch.scenes), batch, strict=False)
+    there = world.allowed.all(1)
+    assert 0 < there.sum() < 40 and not world.allowed[batch.scenes.task[:, 0] > 0.9].any()
+    value = play(p, lost, batch, strict=False).value
+    assert torch.isfinite(value).all() and float(value[there].mean()) > float(value[~there].mean())
+    assert torch.equal(play(p, x, batch, strict=False).value, play(p, x, batch).value)
+
+
 @pytest.mark.parametrize("shape", [{}, {"conditioned": True}, {"fov_deg": 80.0}], ids=str)
 def test_several_vectors_are_played_as_each(shape):
     p = problem(cells=12, saccades=4, distribution=Distribution(cans=3, conditioned="conditioned" in shape), **shape)

@@ -190,11 +190,21 @@ def reachable(head: Head, directions: Tensor) -> Tensor:
     return fixate(head, REACH_RANGE_M * directions)[1]
 
 
-def draw_cells(bias: Bias, scenes: int, cells: int, head: Head, generator: torch.Generator) -> Tensor:
+def draw_cells(
+    bias: Bias, scenes: int, cells: int, head: Head, generator: torch.Generator, strict: bool = True
+) -> Tensor:
     """Draw every scene's cells within reach (B, N, 3), slot by slot.
 
     Every slot has its own sequence of random numbers and takes its first reachable draw, so that a slightly different
     bias gives slightly different cells.
+
+    Args:
+        bias: B mixtures, or one for all.
+        scenes: B.
+        cells: N.
+        head: whose reach.
+        generator: random state.
+        strict: whether cells without a reachable draw are an error; else they are zero vectors.
 
     Raises:
         SettingError: where hardly any draw is reachable.
@@ -226,8 +236,11 @@ def draw_cells(bias: Bias, scenes: int, cells: int, head: Head, generator: torch
         filled = 1 - len(waiting) / (scenes * cells)
         # a share s of reachable draws would have filled 1 − (1 − s)^tried by now
         enough = tried < 512 or filled > 1 - (1 - _FEWEST_ACCEPTED) ** tried
+        enough = enough and tried < 16 / _FEWEST_ACCEPTED
+        if not (strict or enough):
+            break
         require(
-            enough and tried < 16 / _FEWEST_ACCEPTED,
+            enough,
             "reachable",
             f"{filled:.1%} of the cells after {tried} draws each",
             "at least one draw in a thousand within the head's reach: the bias and the reachable set do not overlap",

@@ -91,22 +91,24 @@ class Problem:
         return other
 
 
-def prepare(problem: Problem, bias: Bias, batch: Batch) -> World:
-    """Draw the cells of a batch and put them into its scenes."""
-    n = len(batch.scenes.nearest_m)
-    cells = draw_cells(bias, n, problem.cells, problem.task.observer.head, torch.Generator().manual_seed(batch.seed))
-    world = world_of(problem.task, batch.scenes, cells, batch.noise)
+def prepare(problem: Problem, bias: Bias, batch: Batch, strict: bool = True) -> World:
+    """Draw the cells of a batch and put them into its scenes; unless strict, cells out of reach do not exist."""
+    n, rng = len(batch.scenes.nearest_m), torch.Generator().manual_seed(batch.seed)
+    cells = draw_cells(bias, n, problem.cells, problem.task.observer.head, rng, strict)
+    made = (cells != 0).any(-1)
+    cells = torch.where(made[..., None], cells, cells.new_tensor([1.0, 0.0, 0.0]))
+    world = world_of(problem.task, batch.scenes, cells, batch.noise)._replace(allowed=made)
     if problem.field is not None:
         mean, std = look_up(problem.field, cells)
         world = world._replace(prior_mean=mean, prior_precision=std**-2)
     return world
 
 
-def play(problem: Problem, vector: Tensor, batch: Batch) -> Run:
-    """The episodes of a batch with the hard policy; the same batch gives the same episodes."""
+def play(problem: Problem, vector: Tensor, batch: Batch, strict: bool = True) -> Run:
+    """The episodes of a batch with the hard policy; the same batch gives the same episodes. See `prepare`."""
     problem = problem.at(vector)
     bias = problem.bias(vector.detach(), batch.scenes)
-    return simulate(problem.task, batch.scenes, prepare(problem, bias, batch), bias.alpha)
+    return simulate(problem.task, batch.scenes, prepare(problem, bias, batch, strict), bias.alpha)
 
 
 def play_each(problem: Problem, vectors: Sequence[Tensor], batch: Batch) -> list[float]:
@@ -137,9 +139,12 @@ def _value(problem: Problem, vector: Tensor, batch: Batch) -> float:
     return -1.0
 
 
-def evaluate(problem: Problem, vector: Tensor, scenes: int, generator: torch.Generator, at_once: int = 256) -> Tensor:
-    """The metric in fresh episodes, (scenes,), with the hard policy."""
+def evaluate(
+    problem: Problem, vector: Tensor, scenes: int, generator: torch.Generator, at_once: int = 256, strict: bool = True
+) -> Tensor:
+    """The metric in fresh episodes, (scenes,), with the hard policy. See `prepare`."""
     parts = []
     for begin in range(0, scenes, at_once):
-        parts.append(play(problem, vector, problem.batch(min(at_once, scenes - begin), generator)).value)
+        batch = problem.batch(min(at_once, scenes - begin), generator)
+        parts.append(play(problem, vector, batch, strict).value)
     return torch.cat(parts)

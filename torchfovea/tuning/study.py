@@ -104,9 +104,7 @@ def curves(
         key = (vector.numpy().tobytes(), split)
         if key not in scored:
             scenes, seed = (schedule.validation_scenes, 0) if split == "validation" else heldout
-            scored[key] = 0.0  # where no cell is within reach
-            with suppress(SettingError):
-                scored[key] = float(evaluate(problem, vector, scenes, stream(split, seed)).mean())
+            scored[key] = float(evaluate(problem, vector, scenes, stream(split, seed), strict=False).mean())
         return scored[key]
 
     budgets = budgets_up_to(schedule.episodes)
