@@ -64,6 +64,31 @@ def test_a_killed_sweep_resumes_to_the_same_table(whole, tmp_path, capsys):
     assert table(folder) == table(whole)
 
 
+def test_no_worker_outlives_a_killed_command():
+    # two that would work for minutes
+    script = (
+        "import os, time\n"
+        "from torchfovea.experiments.workers import worker_pool\n"
+        "if __name__ == '__main__':\n"
+        "    pool = worker_pool(2)\n"
+        "    print(*[pool.submit(os.getpid).result() for _ in range(4)], flush=True)\n"
+        "    [pool.submit(time.sleep, 600) for _ in range(4)]\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as command:
+        assert command.stdout is not None
+        workers = {int(pid) for pid in command.stdout.readline().split()}
+        command.kill()
+    deadline = time.monotonic() + 60
+    while workers and time.monotonic() < deadline:
+        time.sleep(0.2)
+        workers = {pid for pid in workers if Path(f"/proc/{pid}").exists() and _runs(pid)}
+    assert not workers
+
+
+def _runs(pid: int) -> bool:
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"  # a zombie has ended
+
+
 def test_the_sweep_of_fig_5_makes_only_what_is_missing(tmp_path):
     command = [
         "characterize", "experiment=fig5", "profile=quick", "sensor.receptive_fields=100", "distances=2",

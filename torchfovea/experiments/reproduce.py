@@ -5,13 +5,11 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import asdict
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-import torch
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -24,6 +22,7 @@ from torchfovea.experiments.claims import Claim, Verdict, judge, read_claims, se
 from torchfovea.experiments.fig5 import judge_fig5
 from torchfovea.experiments.manifest import finished
 from torchfovea.experiments.report import write_report
+from torchfovea.experiments.workers import worker_pool
 from torchfovea.files import write_csv, write_json, write_result
 from torchfovea.mistakes import describe
 from torchfovea.setting import SettingError
@@ -146,7 +145,7 @@ def _outcomes(tasks: list[Task], workers: int) -> Iterator[tuple[Task, list[Row]
             except Exception as error:
                 yield task, error
         return
-    with ProcessPoolExecutor(workers, get_context("spawn"), torch.set_num_threads, (1,)) as pool:
+    with worker_pool(workers) as pool:
         waiting = {pool.submit(run_task, task): task for task in tasks}
         try:
             for future in as_completed(waiting):

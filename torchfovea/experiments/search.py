@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-import torch
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -22,6 +19,7 @@ from torchfovea.experiments.build import build_matcher, build_observer, choice, 
 from torchfovea.experiments.manifest import finished
 from torchfovea.experiments.rollout import batched, one_episode, roll_out
 from torchfovea.experiments.strategy import build_strategy
+from torchfovea.experiments.workers import worker_pool
 from torchfovea.files import write_csv, write_result
 from torchfovea.perception import Observer, Step
 
@@ -103,7 +101,7 @@ def _episodes(
         return
     # The last episode runs here, where it is drawn; the others in processes of their own.
     settings = OmegaConf.to_yaml(OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"]), resolve=True)
-    with ProcessPoolExecutor(workers, get_context("spawn"), torch.set_num_threads, (1,)) as pool:
+    with worker_pool(workers) as pool:
         waiting = [pool.submit(_elsewhere, settings, seed) for seed in seeds[:-1]]
         try:
             last = one_episode(cfg, observer, seeds[-1], advance(1))
