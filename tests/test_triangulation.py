@@ -15,9 +15,9 @@ from torchfovea.camera import Fisheye, Pinhole
 from torchfovea.chart import cartesian_from_inverse_range, inverse_range_coordinates
 from torchfovea.correspondence import Correspondences
 from torchfovea.gaussian import Gaussian, quadratic3, unpack
-from torchfovea.head import Eyes, Gaze, Head, cyclopean, eyes, fixate, to_ego
+from torchfovea.head import Eyes, Gaze, Head, cyclopean, eyes, fixate, rig_frame, to_ego
 from torchfovea.setting import SettingError
-from torchfovea.triangulation import observe, rig_frame, sigma_root, triangulate, triangulate_rectified
+from torchfovea.triangulation import observe, sigma_root, triangulate, triangulate_rectified
 from torchfovea.unscented import SigmaPoints
 
 HEAD = Head()

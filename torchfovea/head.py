@@ -17,7 +17,7 @@ from torch import Tensor
 from torchfovea.gaussian import columns
 from torchfovea.setting import require
 
-__all__ = ["Eyes", "Gaze", "Head", "clamp_gaze", "cyclopean", "eyes", "fixate", "to_ego"]
+__all__ = ["Eyes", "Gaze", "Head", "clamp_gaze", "cyclopean", "eyes", "fixate", "rig_frame", "to_ego"]
 
 
 class Gaze(NamedTuple):
@@ -192,3 +192,30 @@ def clamp_gaze(head: Head, gaze: Gaze) -> Gaze:
         math.radians(a) for a in (head.pan_limit_deg, head.tilt_up_deg, head.tilt_down_deg, head.vergence_max_deg)
     )
     return Gaze(gaze.pan.clamp(-pan, pan), gaze.tilt.clamp(-up, down), gaze.vergence.clamp(0.0, widest))
+
+
+def rig_frame(eyes: Eyes) -> tuple[Tensor, Tensor, Tensor]:
+    """The rectified frame of two eyes: x along the baseline to the right, z midway between the optical axes.
+
+    For a head it is the cyclopean frame.
+
+    Args:
+        eyes: poses in E, (...).
+
+    Returns:
+        Its axes in E as the columns of R (..., 3, 3), its origin midway between the eyes t (..., 3) and the baseline
+        (...) [m].
+
+    Raises:
+        SettingError: for a baseline of no length.
+
+    Differentiable.
+    """
+    across = eyes.t_right - eyes.t_left
+    baseline = across.square().sum(-1).sqrt()
+    require(bool((baseline > 0).all()), "baseline_m", 0.0, "eyes some distance apart")
+    x = across / baseline[..., None]
+    z = eyes.R_left[..., 2] + eyes.R_right[..., 2]
+    z = z - (z * x).sum(-1, keepdim=True) * x
+    z = z / z.square().sum(-1, keepdim=True).sqrt()
+    return torch.stack([x, torch.linalg.cross(z, x), z], -1), (eyes.t_left + eyes.t_right) / 2, baseline

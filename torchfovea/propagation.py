@@ -18,9 +18,9 @@ from torchfovea.characterization import PlaneSensor, correspond_plane, elementwi
 from torchfovea.chart import inverse_range_coordinates
 from torchfovea.correspondence import Correspondences
 from torchfovea.gaussian import Gaussian, columns, pack, quadratic3, unpack
-from torchfovea.head import Eyes, to_ego
+from torchfovea.head import Eyes, rig_frame, to_ego
 from torchfovea.setting import require
-from torchfovea.triangulation import rig_frame, sigma_root, triangulate, triangulate_rectified
+from torchfovea.triangulation import sigma_root, triangulate, triangulate_rectified
 from torchfovea.unscented import SigmaPoints, unscented_transform
 
 __all__ = [

@@ -12,12 +12,12 @@ from torchfovea.camera import Camera, Pinhole
 from torchfovea.chart import Components, bilinear_moments, in_tangent_frame
 from torchfovea.correspondence import Correspondences
 from torchfovea.gaussian import columns
-from torchfovea.head import Eyes
+from torchfovea.head import Eyes, rig_frame
 from torchfovea.head import to_ego as turn
 from torchfovea.setting import require
 from torchfovea.unscented import SigmaPoints, definiteness, eye_root, moments, root_rows, sigma_components, sigma_root
 
-__all__ = ["Observations", "observe", "rig_frame", "sigma_root", "triangulate", "triangulate_rectified"]
+__all__ = ["Observations", "observe", "sigma_root", "triangulate", "triangulate_rectified"]
 
 BLOCK = 16384  # receptive fields at once on a CPU, so that intermediate results stay in its cache
 
@@ -122,33 +122,6 @@ def _rectified(left: Components, right: Components) -> tuple[Components, Tensor,
         across - back,
         torch.minimum(zl, zr),
     )
-
-
-def rig_frame(eyes: Eyes) -> tuple[Tensor, Tensor, Tensor]:
-    """The rectified frame of two eyes: x along the baseline to the right, z midway between the optical axes.
-
-    For a head it is the cyclopean frame.
-
-    Args:
-        eyes: poses in E, (...).
-
-    Returns:
-        Its axes in E as the columns of R (..., 3, 3), its origin midway between the eyes t (..., 3) and the baseline
-        (...) [m].
-
-    Raises:
-        SettingError: for a baseline of no length.
-
-    Differentiable.
-    """
-    across = eyes.t_right - eyes.t_left
-    baseline = across.square().sum(-1).sqrt()
-    require(bool((baseline > 0).all()), "baseline_m", 0.0, "eyes some distance apart")
-    x = across / baseline[..., None]
-    z = eyes.R_left[..., 2] + eyes.R_right[..., 2]
-    z = z - (z * x).sum(-1, keepdim=True) * x
-    z = z / z.square().sum(-1, keepdim=True).sqrt()
-    return torch.stack([x, torch.linalg.cross(z, x), z], -1), (eyes.t_left + eyes.t_right) / 2, baseline
 
 
 class _Rig(NamedTuple):

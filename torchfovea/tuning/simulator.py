@@ -19,12 +19,11 @@ from torchfovea.acquisition import upper_confidence_bound
 from torchfovea.camera import Pinhole
 from torchfovea.correspondence import eye_sigma_px
 from torchfovea.gaussian import columns
-from torchfovea.head import Eyes, Gaze, cyclopean, eyes, fixate
+from torchfovea.head import Eyes, Gaze, cyclopean, eyes, fixate, rig_frame
 from torchfovea.metrics import gap
 from torchfovea.perception import Observer
 from torchfovea.reward import RewardBelief, range_from_inverse_range
 from torchfovea.setting import require
-from torchfovea.triangulation import rig_frame
 from torchfovea.tuning.scenes import Scenes, cast
 
 __all__ = [
