@@ -17,18 +17,18 @@ from typing import Any
 
 import torch
 
-from torchfovea.camera import Pinhole
-from torchfovea.correspondence import Correspondences
 from torchfovea.experiments.sense import motorcycle
-from torchfovea.head import eyes, fixate
-from torchfovea.layout import LogPolar, Retina, Uniform
-from torchfovea.matching import match_sgbm
-from torchfovea.rectified import match_disparity, match_rectified
-from torchfovea.rig import verged
+from torchfovea.sensing.camera import Pinhole
+from torchfovea.sensing.correspondence import Correspondences
+from torchfovea.sensing.head import eyes, fixate
+from torchfovea.sensing.layout import LogPolar, Retina, Uniform
 from torchfovea.sim.cans import Cans
 from torchfovea.sim.scene import build_scene
 from torchfovea.sim.world import World
-from torchfovea.sweep import match_sweep, match_sweep_rectified
+from torchfovea.stereo.matching import match_sgbm
+from torchfovea.stereo.rectified import match_disparity, match_rectified
+from torchfovea.stereo.rig import verged
+from torchfovea.stereo.sweep import match_sweep, match_sweep_rectified
 
 FOVEA_PX = 20.0
 RETINAS = {"log_polar": LogPolar(), "uniform": Uniform()}

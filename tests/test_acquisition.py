@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import integrate, stats
 
-from torchfovea import acquisition as aq
-from torchfovea import policies as po
+from torchfovea.deciding import acquisition as aq
+from torchfovea.deciding import policies as po
 from torchfovea.setting import SettingError
 
 mpmath.mp.dps = 60

@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 import torch
 
-from torchfovea import sphere
 from torchfovea.bench import paths, retina_paths, steps
 from torchfovea.bench.look import saccade
 from torchfovea.bench.timing import Growth, Path, copy_bandwidth, interleaved, nbytes, same, slope
 from torchfovea.cli import main
-from torchfovea.egosphere import Fusion
+from torchfovea.deciding.strategies import expected_improvement, upper_confidence_bound
 from torchfovea.experiments import bench
-from torchfovea.head import fixate
-from torchfovea.layout import LogPolar
+from torchfovea.memory import sphere
+from torchfovea.memory.egosphere import Fusion
 from torchfovea.perception import Observer
+from torchfovea.sensing.head import fixate
+from torchfovea.sensing.layout import LogPolar
 from torchfovea.setting import SettingError
-from torchfovea.strategies import expected_improvement, upper_confidence_bound
 
 FULL = Observer(retina=LogPolar(1500))
 PLAIN = dataclasses.replace(FULL, fusion=Fusion(fill=False, conflict=math.inf))

@@ -15,7 +15,18 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchfovea.calibration import (
+from torchfovea.cli import main
+from torchfovea.sensing.camera import Fisheye, Pinhole
+from torchfovea.sensing.correspondence import Budget, Clues, Correspondences, Disparity, eye_sigma_px
+from torchfovea.sensing.geometric import correspond_points
+from torchfovea.sensing.head import Gaze, Head, eyes, to_ego
+from torchfovea.sensing.layout import LogPolar, Uniform
+from torchfovea.sensing.triangulation import observe
+from torchfovea.setting import SettingError
+from torchfovea.stereo.confidence import BLOCK_PX, read_clues
+from torchfovea.stereo.matching import correspondences
+from torchfovea.stereo.rectified import match_disparity
+from torchfovea.studies.calibration import (
     Judged,
     Likelihood,
     concatenate,
@@ -26,17 +37,6 @@ from torchfovea.calibration import (
     select,
     sigma_of,
 )
-from torchfovea.camera import Fisheye, Pinhole
-from torchfovea.cli import main
-from torchfovea.confidence import BLOCK_PX, read_clues
-from torchfovea.correspondence import Budget, Clues, Correspondences, Disparity, eye_sigma_px
-from torchfovea.geometric import correspond_points
-from torchfovea.head import Gaze, Head, eyes, to_ego
-from torchfovea.layout import LogPolar, Uniform
-from torchfovea.matching import correspondences
-from torchfovea.rectified import match_disparity
-from torchfovea.setting import SettingError
-from torchfovea.triangulation import observe
 
 RETINA = LogPolar(3000)
 
@@ -297,7 +297,7 @@ def test_matches_carry_the_same_sigma_as_the_fit_assumes():
     clues = read_clues(match.disparity, place, shift, width)
     own = replace(budget, source_px=120)
     same = torch.eye(3)
-    from torchfovea.head import Eyes
+    from torchfovea.sensing.head import Eyes
 
     pose = Eyes(same, torch.zeros(3), same, torch.tensor([0.1, 0.0, 0.0]))
     data, which = judged(

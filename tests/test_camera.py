@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchfovea.camera import Fisheye, Pinhole, image_camera
+from torchfovea.sensing.camera import Fisheye, Pinhole, image_camera
 from torchfovea.setting import SettingError
 
 CAMERAS = [Pinhole(41.4), Pinhole(300.0, 12.0, -3.0), Fisheye(80.0), Fisheye(60.0, 5.0, 7.0)]

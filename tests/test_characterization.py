@@ -10,8 +10,12 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchfovea.camera import Fisheye, Pinhole
-from torchfovea.characterization import (
+from torchfovea.cli import main
+from torchfovea.sensing.camera import Fisheye, Pinhole
+from torchfovea.sensing.correspondence import Budget
+from torchfovea.sensing.layout import LogPolar, Uniform
+from torchfovea.setting import SettingError
+from torchfovea.studies.characterization import (
     PlaneSensor,
     characterize_planes,
     correspond_plane,
@@ -24,12 +28,14 @@ from torchfovea.characterization import (
     spread_over_vergence,
     straight_eyes,
 )
-from torchfovea.cli import main
-from torchfovea.correspondence import Budget
-from torchfovea.layout import LogPolar, Uniform
-from torchfovea.plane import draw_plane, octave_noise
-from torchfovea.realised import look_at_plane, off_lattice_distances, pool_sights, realised_information, rings_of_error
-from torchfovea.setting import SettingError
+from torchfovea.studies.plane import draw_plane, octave_noise
+from torchfovea.studies.realised import (
+    look_at_plane,
+    off_lattice_distances,
+    pool_sights,
+    realised_information,
+    rings_of_error,
+)
 
 BASELINE = 0.065
 CAMERA = Pinhole.from_fov(90, 100)

@@ -7,14 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from torchfovea.chart import (
+from torchfovea.gaussian import Gaussian, columns, pack, unpack
+from torchfovea.sensing.chart import (
     basis,
     cartesian_from_inverse_range,
     in_tangent_frame,
     inverse_range_coordinates,
     turn_cartesian,
 )
-from torchfovea.gaussian import Gaussian, columns, pack, unpack
 
 
 def units(count: int, seed: int, dtype: torch.dtype = torch.float64) -> torch.Tensor:

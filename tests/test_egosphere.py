@@ -9,9 +9,9 @@ from filterpy.kalman import KalmanFilter
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchfovea.association import associate, in_front
-from torchfovea.chart import basis, cartesian_from_inverse_range
-from torchfovea.egosphere import (
+from torchfovea.gaussian import Gaussian, columns, inverse3, pack, positive_definite, unpack
+from torchfovea.memory.association import associate, in_front
+from torchfovea.memory.egosphere import (
     Fusion,
     Prior,
     belief,
@@ -21,12 +21,12 @@ from torchfovea.egosphere import (
     new_egosphere,
     remember,
 )
-from torchfovea.gaussian import Gaussian, columns, inverse3, pack, positive_definite, unpack
-from torchfovea.nearest import build_index, neighbour_spacing_rad
-from torchfovea.pooling import add_common, nearness, pool, pool_patches
+from torchfovea.memory.nearest import build_index, neighbour_spacing_rad
+from torchfovea.memory.pooling import add_common, nearness, pool, pool_patches
+from torchfovea.memory.sphere import fibonacci_directions
+from torchfovea.sensing.chart import basis, cartesian_from_inverse_range
+from torchfovea.sensing.triangulation import Observations
 from torchfovea.setting import SettingError
-from torchfovea.sphere import fibonacci_directions
-from torchfovea.triangulation import Observations
 
 ONE = torch.Size([])
 AHEAD = torch.tensor([[1.0, 0, 0]], dtype=torch.float64)

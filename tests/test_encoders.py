@@ -5,12 +5,12 @@ import math
 import pytest
 import torch
 
-from torchfovea.chart import inverse_range_coordinates
-from torchfovea.encoders import encoder_covariance, encoder_jacobian
 from torchfovea.gaussian import unpack
-from torchfovea.head import Gaze, Head, eyes, fixate, to_ego
+from torchfovea.memory.encoders import encoder_covariance, encoder_jacobian
+from torchfovea.sensing.chart import inverse_range_coordinates
+from torchfovea.sensing.head import Gaze, Head, eyes, fixate, to_ego
+from torchfovea.sensing.triangulation import triangulate
 from torchfovea.setting import SettingError
-from torchfovea.triangulation import triangulate
 
 HEAD = Head()
 SIGMA = tuple(math.radians(a) for a in (0.1, 0.07, 0.12))

@@ -7,18 +7,18 @@ import pytest
 import torch
 
 from torchfovea.arena import Fixation, Look, Move, Together, Truth
-from torchfovea.camera import Pinhole
-from torchfovea.correspondence import Budget, Correspondences
-from torchfovea.egosphere import Fusion, Prior
+from torchfovea.deciding.strategies import expected_improvement, probability_of_improvement, upper_confidence_bound
 from torchfovea.episode import run_episode, run_episodes, stack_minds
-from torchfovea.geometric import correspond_points
-from torchfovea.head import Gaze, Head, clamp_gaze, cyclopean, eyes, fixate, to_ego
-from torchfovea.layout import LogPolar, Uniform
+from torchfovea.memory.egosphere import Fusion, Prior
+from torchfovea.memory.sphere import fibonacci_directions
 from torchfovea.perception import Eligibility, Observer, decide, new_mind, perceive
+from torchfovea.sensing.camera import Pinhole
+from torchfovea.sensing.correspondence import Budget, Correspondences
+from torchfovea.sensing.geometric import correspond_points
+from torchfovea.sensing.head import Gaze, Head, clamp_gaze, cyclopean, eyes, fixate, to_ego
+from torchfovea.sensing.layout import LogPolar, Uniform
+from torchfovea.sensing.unscented import SigmaPoints
 from torchfovea.setting import SettingError
-from torchfovea.sphere import fibonacci_directions
-from torchfovea.strategies import expected_improvement, probability_of_improvement, upper_confidence_bound
-from torchfovea.unscented import SigmaPoints
 
 HEAD = Head()
 ROOM_M = 3.0

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from torchfovea.camera import Fisheye, Pinhole
-from torchfovea.disparity_files import load_disparity
-from torchfovea.external import External, load_matcher, match_external, match_external_rectified
-from torchfovea.layout import LogPolar, Uniform
-from torchfovea.rectified import match_disparity
-from torchfovea.rig import verged
+from torchfovea.sensing.camera import Fisheye, Pinhole
+from torchfovea.sensing.layout import LogPolar, Uniform
 from torchfovea.setting import SettingError
+from torchfovea.stereo.disparity_files import load_disparity
+from torchfovea.stereo.external import External, load_matcher, match_external, match_external_rectified
+from torchfovea.stereo.rectified import match_disparity
+from torchfovea.stereo.rig import verged
 
 CAMERAS = Pinhole(120.0, 50.0, 38.0), Pinhole(120.0, 55.0, 38.0)
 SIZE = (80, 100)

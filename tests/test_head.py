@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from torchfovea.head import Gaze, Head, clamp_gaze, cyclopean, eyes, fixate, to_ego
+from torchfovea.sensing.head import Gaze, Head, clamp_gaze, cyclopean, eyes, fixate, to_ego
 from torchfovea.setting import SettingError
 
 VIZZY, HUMAN = Head(), Head(baseline_m=0.065, eyes_forward_m=0.08, eyes_up_m=0.06, tilt_down_deg=60, tilt_up_deg=50)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy import stats
 
-from torchfovea import infomax as im
+from torchfovea.deciding import infomax as im
 from torchfovea.setting import SettingError
 
 dtypes = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -9,13 +9,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchfovea.camera import Fisheye, Pinhole, image_camera
-from torchfovea.correspondence import Budget, Disparity, eye_sigma_px
-from torchfovea.matching import SGBM, match_sgbm, posed, read_disparity, verged
-from torchfovea.rectified import match_disparity, match_rectified
-from torchfovea.retina import LogPolar, Uniform
+from torchfovea.sensing.camera import Fisheye, Pinhole, image_camera
+from torchfovea.sensing.correspondence import Budget, Disparity, eye_sigma_px
+from torchfovea.sensing.retina import LogPolar, Uniform
 from torchfovea.setting import SettingError
-from torchfovea.sgbm import disparity_sgbm
+from torchfovea.stereo.matching import SGBM, match_sgbm, posed, read_disparity, verged
+from torchfovea.stereo.rectified import match_disparity, match_rectified
+from torchfovea.stereo.sgbm import disparity_sgbm
 
 BASELINE = 0.204
 SIZE = 240

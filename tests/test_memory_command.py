@@ -10,9 +10,9 @@ import torch
 from torchfovea.cli import main
 from torchfovea.config import conf_dir
 from torchfovea.experiments.memory_study import judge_cells
+from torchfovea.memory.sphere import fibonacci_directions
 from torchfovea.sim.scene import Cans, build_scene
 from torchfovea.sim.world import World
-from torchfovea.sphere import fibonacci_directions
 
 BIASES = sorted(path.stem for path in (Path(conf_dir()) / "memory").glob("*.yaml"))
 SMALL = ["episodes=1", "sensor.receptive_fields=1500", "memory.cells=300", "scene=cans"]

@@ -5,14 +5,14 @@ import math
 import pytest
 import torch
 
-from torchfovea.chart import basis
-from torchfovea.egosphere import Fusion, Prior, belief, cartesian_belief, fuse, new_egosphere
 from torchfovea.gaussian import Gaussian, unpack
-from torchfovea.moving import Motion, motion, move, resample
-from torchfovea.nearest import build_index, neighbour_spacing_rad
-from torchfovea.pooling import pool, pool_patches
+from torchfovea.memory.egosphere import Fusion, Prior, belief, cartesian_belief, fuse, new_egosphere
+from torchfovea.memory.moving import Motion, motion, move, resample
+from torchfovea.memory.nearest import build_index, neighbour_spacing_rad
+from torchfovea.memory.pooling import pool, pool_patches
+from torchfovea.memory.sphere import fibonacci_directions
+from torchfovea.sensing.chart import basis
 from torchfovea.setting import SettingError
-from torchfovea.sphere import fibonacci_directions
 
 ONE = torch.Size([])
 PRIOR = Prior()

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from torchfovea.nearest import (
+from torchfovea.memory.nearest import (
     _by_all_pairs,
     _by_tree,
     build_index,
@@ -16,8 +16,7 @@ from torchfovea.nearest import (
     nearest_observation,
     neighbour_spacing_rad,
 )
-from torchfovea.setting import SettingError
-from torchfovea.sphere import (
+from torchfovea.memory.sphere import (
     direction_mixture,
     fibonacci_directions,
     geodesic_directions,
@@ -25,6 +24,7 @@ from torchfovea.sphere import (
     sample,
     truncated_icosahedron_directions,
 )
+from torchfovea.setting import SettingError
 
 F64 = torch.float64
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]

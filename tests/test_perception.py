@@ -9,22 +9,22 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from torchfovea import acquisition, strategies
-from torchfovea.camera import Pinhole
 from torchfovea.config import conf_dir
-from torchfovea.correspondence import Budget
-from torchfovea.egosphere import Fusion, Prior
+from torchfovea.deciding import acquisition, strategies
+from torchfovea.deciding.strategies import View
 from torchfovea.experiments.build import build_observer
 from torchfovea.experiments.strategy import STRATEGIES, build_stop, build_strategy
-from torchfovea.head import Gaze, Head
-from torchfovea.layout import LogPolar
+from torchfovea.memory.egosphere import Fusion, Prior
+from torchfovea.memory.sphere import fibonacci_directions
 from torchfovea.perception import Eligibility, Observer, decide, gaze_at, new_mind
+from torchfovea.sensing.camera import Pinhole
+from torchfovea.sensing.correspondence import Budget
+from torchfovea.sensing.head import Gaze, Head
+from torchfovea.sensing.layout import LogPolar
 from torchfovea.setting import SettingError
 from torchfovea.sim.cans import Cans
 from torchfovea.sim.room import Room
 from torchfovea.sim.scene import AttentionWorld
-from torchfovea.sphere import fibonacci_directions
-from torchfovea.strategies import View
 
 
 def view_of(rows: int = 2, count: int = 40, dtype=torch.float64, seed: int = 0) -> View:

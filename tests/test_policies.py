@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from torchfovea import acquisition as aq
-from torchfovea import policies as po
-from torchfovea.infomax import saccade_degrees
+from torchfovea.deciding import acquisition as aq
+from torchfovea.deciding import policies as po
+from torchfovea.deciding.infomax import saccade_degrees
 from torchfovea.setting import SettingError
 
 

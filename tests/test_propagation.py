@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from torchfovea.camera import Pinhole
-from torchfovea.characterization import PlaneSensor, elementwise_jacobian
-from torchfovea.correspondence import Budget
 from torchfovea.gaussian import Gaussian, pack, unpack
-from torchfovea.layout import LogPolar
-from torchfovea.propagation import (
+from torchfovea.sensing.camera import Pinhole
+from torchfovea.sensing.correspondence import Budget
+from torchfovea.sensing.layout import LogPolar
+from torchfovea.sensing.triangulation import observe
+from torchfovea.sensing.unscented import SigmaPoints
+from torchfovea.setting import SettingError
+from torchfovea.studies.characterization import PlaneSensor, elementwise_jacobian
+from torchfovea.studies.propagation import (
     chart_point,
     compare_gaussians,
     first_order,
@@ -20,9 +23,6 @@ from torchfovea.propagation import (
     stereo_cases,
     unscented,
 )
-from torchfovea.setting import SettingError
-from torchfovea.triangulation import observe
-from torchfovea.unscented import SigmaPoints
 
 SENSOR = PlaneSensor(Pinhole.from_fov(90, 100), LogPolar(), budget=Budget())
 RATIOS = torch.tensor([0.02, 0.1, 0.2])

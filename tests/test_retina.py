@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchfovea.retina import LogPolar, Uniform, cortical, covered, fovea, interpolate, reconstruct
+from torchfovea.sensing.retina import LogPolar, Uniform, cortical, covered, fovea, interpolate, reconstruct
 from torchfovea.setting import SettingError
 
 LAYOUTS = [

@@ -8,9 +8,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchfovea import reward as rw
+from torchfovea.deciding import reward as rw
+from torchfovea.deciding.reward import RewardBelief
 from torchfovea.gaussian import Gaussian, pack, unpack
-from torchfovea.reward import RewardBelief
 from torchfovea.setting import SettingError
 
 dtypes = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from torchfovea.cli import main
-from torchfovea.disparity_files import load_disparity
 from torchfovea.experiments.images import read_image, write_ply
 from torchfovea.setting import SettingError
+from torchfovea.stereo.disparity_files import load_disparity
 
 SIZE = (160, 200)
 FOCAL, BASELINE = 180.0, 0.1

@@ -8,8 +8,8 @@ import pytest
 import torch
 from scipy import stats
 
-from torchfovea import significance as sg
 from torchfovea.setting import SettingError
+from torchfovea.studies import significance as sg
 
 
 def generator(seed=0):

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchfovea.camera import Fisheye, Pinhole, image_camera
-from torchfovea.head import eyes, fixate
+from torchfovea.sensing.camera import Fisheye, Pinhole, image_camera
+from torchfovea.sensing.head import eyes, fixate
 from torchfovea.setting import SettingError
 from torchfovea.sim import backend, gl, rays, world
 from torchfovea.sim.room import Room

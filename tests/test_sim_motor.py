@@ -1,4 +1,4 @@
-"""The head in MuJoCo is the head of torchfovea.head, and both motors get it there."""
+"""The head in MuJoCo is the head of torchfovea.sensing.head, and both motors get it there."""
 
 import math
 
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchfovea.head import Gaze, Head, eyes
+from torchfovea.sensing.head import Gaze, Head, eyes
 from torchfovea.setting import SettingError
 from torchfovea.sim.head_model import CAMERAS, JOINTS
 from torchfovea.sim.motor import InstantMotor, turned_deg

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchfovea.camera import Fisheye, Pinhole, image_camera
-from torchfovea.head import Gaze, Head, eyes, fixate
+from torchfovea.sensing.camera import Fisheye, Pinhole, image_camera
+from torchfovea.sensing.head import Gaze, Head, eyes, fixate
 from torchfovea.setting import SettingError
 from torchfovea.sim.model import EgoPose, Scene
 from torchfovea.sim.rays import MISS_RANGE_M, cast, render

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchfovea.head import Gaze, Head, cyclopean, eyes, fixate
+from torchfovea.sensing.head import Gaze, Head, cyclopean, eyes, fixate
 from torchfovea.setting import SettingError
 from torchfovea.sim.rays import cast
 from torchfovea.sim.room import CAN, FLOOR, POLE, TARGET

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from torchfovea.camera import Fisheye, Pinhole
-from torchfovea.head import Gaze, Head, cyclopean, eyes, fixate
+from torchfovea.sensing.camera import Fisheye, Pinhole
+from torchfovea.sensing.head import Gaze, Head, cyclopean, eyes, fixate
 from torchfovea.sim.rays import cast
 from torchfovea.sim.scene import AttentionWorld, Cans, EgoPose, build_scene
 from torchfovea.sim.world import World

@@ -12,8 +12,7 @@ from scipy.integrate import quad
 from scipy.spatial import cKDTree
 from torch.autograd import gradcheck, gradgradcheck
 
-from torchfovea.setting import SettingError
-from torchfovea.sphere import (
+from torchfovea.memory.sphere import (
     DirectionMixture,
     direction_mixture,
     fibonacci_directions,
@@ -27,6 +26,7 @@ from torchfovea.sphere import (
     sphere_quadrature,
     truncated_icosahedron_directions,
 )
+from torchfovea.setting import SettingError
 
 MEMORY = Path(__file__).parents[1] / "conf" / "memory"
 F64 = torch.float64

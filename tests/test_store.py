@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from torchfovea.egosphere import EgoSphere, Prior, fuse, new_egosphere
 from torchfovea.gaussian import Information
-from torchfovea.pooling import pool_patches
+from torchfovea.memory.egosphere import EgoSphere, Prior, fuse, new_egosphere
+from torchfovea.memory.pooling import pool_patches
+from torchfovea.memory.sphere import fibonacci_directions
+from torchfovea.memory.store import load_memory, save_memory
 from torchfovea.setting import SettingError
-from torchfovea.sphere import fibonacci_directions
-from torchfovea.store import load_memory, save_memory
 
 
 def some_memory(dtype, batch=()) -> EgoSphere:

@@ -5,16 +5,16 @@ import pytest
 import torch
 from scipy.ndimage import convolve
 
-from torchfovea.camera import Fisheye, Pinhole, image_camera
-from torchfovea.correspondence import Budget, eye_sigma_px
-from torchfovea.head import Eyes
-from torchfovea.layout import LogPolar, Uniform
-from torchfovea.rig import StereoRig, posed, verged
-from torchfovea.semiglobal import aggregate
+from torchfovea.sensing.camera import Fisheye, Pinhole, image_camera
+from torchfovea.sensing.correspondence import Budget, eye_sigma_px
+from torchfovea.sensing.head import Eyes
+from torchfovea.sensing.layout import LogPolar, Uniform
+from torchfovea.sensing.triangulation import observe
 from torchfovea.setting import SettingError
-from torchfovea.sheets import average, nearest_rf, read_sheet, sheets
-from torchfovea.sweep import Sweep, Volume, match_sweep, match_sweep_rectified
-from torchfovea.triangulation import observe
+from torchfovea.stereo.rig import StereoRig, posed, verged
+from torchfovea.stereo.semiglobal import aggregate
+from torchfovea.stereo.sheets import average, nearest_rf, read_sheet, sheets
+from torchfovea.stereo.sweep import Sweep, Volume, match_sweep, match_sweep_rectified
 
 BASELINE_M = 0.2
 RETINAS = [LogPolar(3000), Uniform(3000), LogPolar(3000, uniform_fovea=True)]

@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from torchfovea.arena import Together
-from torchfovea.camera import Pinhole
-from torchfovea.head import Gaze, eyes, to_ego
-from torchfovea.layout import LogPolar, Uniform
 from torchfovea.perception import Observer
+from torchfovea.sensing.camera import Pinhole
+from torchfovea.sensing.head import Gaze, eyes, to_ego
+from torchfovea.sensing.layout import LogPolar, Uniform
 from torchfovea.sim.arena import Arena, draw_fields
 from torchfovea.sim.arenas import GeometricArenas
 from torchfovea.sim.cans import Cans

@@ -10,15 +10,15 @@ from hypothesis import strategies as st
 from kornia.geometry.epipolar import triangulate_points
 from scipy.optimize import least_squares
 
-from torchfovea import triangulation
-from torchfovea.camera import Fisheye, Pinhole
-from torchfovea.chart import cartesian_from_inverse_range, inverse_range_coordinates
-from torchfovea.correspondence import Correspondences
 from torchfovea.gaussian import Gaussian, quadratic3, unpack
-from torchfovea.head import Eyes, Gaze, Head, cyclopean, eyes, fixate, rig_frame, to_ego
+from torchfovea.sensing import triangulation
+from torchfovea.sensing.camera import Fisheye, Pinhole
+from torchfovea.sensing.chart import cartesian_from_inverse_range, inverse_range_coordinates
+from torchfovea.sensing.correspondence import Correspondences
+from torchfovea.sensing.head import Eyes, Gaze, Head, cyclopean, eyes, fixate, rig_frame, to_ego
+from torchfovea.sensing.triangulation import observe, sigma_root, triangulate, triangulate_rectified
+from torchfovea.sensing.unscented import SigmaPoints
 from torchfovea.setting import SettingError
-from torchfovea.triangulation import observe, sigma_root, triangulate, triangulate_rectified
-from torchfovea.unscented import SigmaPoints
 
 HEAD = Head()
 CAMERA = Pinhole.from_fov(90, 100)

@@ -9,13 +9,13 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from torchfovea.camera import Pinhole
 from torchfovea.cli import main
 from torchfovea.experiments.build import build_cells
-from torchfovea.head import Head
+from torchfovea.memory.sphere import direction_mixture, log_density, log_normalizer, sphere_quadrature
 from torchfovea.perception import Observer
+from torchfovea.sensing.camera import Pinhole
+from torchfovea.sensing.head import Head
 from torchfovea.setting import SettingError
-from torchfovea.sphere import direction_mixture, log_density, log_normalizer, sphere_quadrature
 from torchfovea.tuning import train as training
 from torchfovea.tuning.baselines import SEARCHES, hand, table_1
 from torchfovea.tuning.bias import (

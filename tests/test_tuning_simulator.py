@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from torchfovea.camera import Fisheye, Pinhole
-from torchfovea.geometric import correspond_points
-from torchfovea.head import Eyes, Gaze, Head, cyclopean, eyes, fixate, to_ego
-from torchfovea.layout import Uniform
 from torchfovea.perception import Observer
+from torchfovea.sensing.camera import Fisheye, Pinhole
+from torchfovea.sensing.geometric import correspond_points
+from torchfovea.sensing.head import Eyes, Gaze, Head, cyclopean, eyes, fixate, to_ego
+from torchfovea.sensing.layout import Uniform
+from torchfovea.sensing.triangulation import observe
 from torchfovea.setting import SettingError
-from torchfovea.triangulation import observe
 from torchfovea.tuning.bias import Shape
 from torchfovea.tuning.problem import Problem
 from torchfovea.tuning.scenes import Distribution, Scenes, cast, draw_scenes, stream

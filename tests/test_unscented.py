@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchfovea.gaussian import columns, pack, positive_definite
+from torchfovea.sensing.unscented import SigmaPoints, definiteness, unscented_transform
 from torchfovea.setting import SettingError
-from torchfovea.unscented import SigmaPoints, definiteness, unscented_transform
 
 CHOICES = [SigmaPoints(), SigmaPoints.paper()]
 

@@ -4,19 +4,24 @@ The names below are the library; each is documented in the module it comes from.
 MuJoCo nor Hydra nor matplotlib nor OpenCV.
 """
 
-from torchfovea.acquisition import choose, expected_improvement, log_expected_improvement, upper_confidence_bound
-from torchfovea.camera import Fisheye, Pinhole
-from torchfovea.correspondence import Budget, Correspondences
-from torchfovea.egosphere import EgoSphere, Fusion, Prior, belief, cartesian_belief, new_egosphere, remember
+from torchfovea.deciding.acquisition import (
+    choose,
+    expected_improvement,
+    log_expected_improvement,
+    upper_confidence_bound,
+)
 from torchfovea.gaussian import Gaussian, Information
-from torchfovea.head import Eyes, Gaze, Head, cyclopean, eyes, fixate
-from torchfovea.layout import LogPolar, Uniform
+from torchfovea.memory.egosphere import EgoSphere, Fusion, Prior, belief, cartesian_belief, new_egosphere, remember
+from torchfovea.memory.sphere import DirectionMixture, direction_mixture, log_density, sample
 from torchfovea.perception import Eligibility, Observer, decide, new_mind, perceive
-from torchfovea.retina import fovea, reconstruct
+from torchfovea.sensing.camera import Fisheye, Pinhole
+from torchfovea.sensing.correspondence import Budget, Correspondences
+from torchfovea.sensing.head import Eyes, Gaze, Head, cyclopean, eyes, fixate
+from torchfovea.sensing.layout import LogPolar, Uniform
+from torchfovea.sensing.retina import fovea, reconstruct
+from torchfovea.sensing.triangulation import Observations, observe, triangulate
+from torchfovea.sensing.unscented import SigmaPoints, unscented_transform
 from torchfovea.setting import SettingError
-from torchfovea.sphere import DirectionMixture, direction_mixture, log_density, sample
-from torchfovea.triangulation import Observations, observe, triangulate
-from torchfovea.unscented import SigmaPoints, unscented_transform
 
 __version__ = "0.1.0"
 

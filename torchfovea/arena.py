@@ -8,8 +8,8 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from torchfovea.correspondence import Correspondences
-from torchfovea.head import Gaze
+from torchfovea.sensing.correspondence import Correspondences
+from torchfovea.sensing.head import Gaze
 
 __all__ = ["Arena", "Arenas", "Fixation", "Look", "Move", "Together", "Truth", "row", "stack"]
 

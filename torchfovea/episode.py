@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchfovea.acquisition import known_well_enough
 from torchfovea.arena import Arena, Arenas, Fixation, Look, Move, Together, Truth, row, stack
-from torchfovea.head import Gaze, eyes, fixate
+from torchfovea.deciding.acquisition import known_well_enough
+from torchfovea.memory.nearest import join_indices
 from torchfovea.metrics import gap, global_information, local_information, near_target, regret, saccades_to_target
-from torchfovea.nearest import join_indices
 from torchfovea.perception import Mind, Observer, Step, decide, gaze_at, perceive
+from torchfovea.sensing.head import Gaze, eyes, fixate
 from torchfovea.setting import require
 
 __all__ = [
@@ -149,8 +149,8 @@ def run_episodes(
         far_m: what a fixation on the floor or on nothing counts as.
         near_target_m: R_NN of Eq. 54.
         each: called after every decision with t (from 0), the looks and the steps.
-        stop: (tolerance, probability) of `torchfovea.acquisition.known_well_enough`: when it holds, the best cell is
-            fixated, and the head stays there without another look; None: never.
+        stop: (tolerance, probability) of `torchfovea.deciding.acquisition.known_well_enough`: when it holds, the best
+            cell is fixated, and the head stays there without another look; None: never.
 
     Raises:
         SettingError: for no saccades or a nearest range that is not between 0 and far_m.

@@ -10,10 +10,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchfovea.acquisition import Generators, choose
-from torchfovea.camera import Camera, Pinhole
-from torchfovea.correspondence import Budget, Correspondences
-from torchfovea.egosphere import (
+from torchfovea.deciding.acquisition import Generators, choose
+from torchfovea.deciding.reward import RewardBelief, inverse_range_from_range, range_from_inverse_range, range_reward
+from torchfovea.deciding.strategies import DEFAULT, Strategy, View, evaluate
+from torchfovea.gaussian import Gaussian
+from torchfovea.memory.egosphere import (
     Common,
     EgoSphere,
     Fusion,
@@ -23,16 +24,15 @@ from torchfovea.egosphere import (
     new_egosphere,
     remember,
 )
-from torchfovea.encoders import encoder_covariance
-from torchfovea.gaussian import Gaussian
-from torchfovea.head import Eyes, Gaze, Head, cyclopean, fixate
-from torchfovea.layout import LogPolar, Retina
-from torchfovea.nearest import CellIndex, build_index, neighbour_spacing_rad
-from torchfovea.reward import RewardBelief, inverse_range_from_range, range_from_inverse_range, range_reward
+from torchfovea.memory.encoders import encoder_covariance
+from torchfovea.memory.nearest import CellIndex, build_index, neighbour_spacing_rad
+from torchfovea.sensing.camera import Camera, Pinhole
+from torchfovea.sensing.correspondence import Budget, Correspondences
+from torchfovea.sensing.head import Eyes, Gaze, Head, cyclopean, fixate
+from torchfovea.sensing.layout import LogPolar, Retina
+from torchfovea.sensing.triangulation import observe
+from torchfovea.sensing.unscented import SigmaPoints
 from torchfovea.setting import require
-from torchfovea.strategies import DEFAULT, Strategy, View, evaluate
-from torchfovea.triangulation import observe
-from torchfovea.unscented import SigmaPoints
 
 __all__ = ["Eligibility", "Mind", "Observer", "Step", "decide", "gaze_at", "new_mind", "perceive", "reward_of"]
 
@@ -64,11 +64,11 @@ class Observer:
         retina: both eyes' retina.
         budget: where a correspondence's standard deviation comes from.
         points: sigma points of the unscented transform; None: those that suit the chart.
-        rotated: see `torchfovea.triangulation.sigma_root`.
+        rotated: see `torchfovea.sensing.triangulation.sigma_root`.
         fusion: how observations enter the memory.
         prior: of a cell not yet seen.
         reward: `inverse_range` or `range`: near is good, in either measure (Eq. 36).
-        acquisition: scores the cells, see `torchfovea.strategies`.
+        acquisition: scores the cells, see `torchfovea.deciding.strategies`.
         eligibility: which cells may be fixated.
     """
 
@@ -141,7 +141,7 @@ def perceive(
         mind: before.
         matches: the saccade's correspondences (..., N).
         eyes: where the eyes were.
-        common: what the receptive fields' errors share, see `torchfovea.egosphere.remember`; by default what the
+        common: what the receptive fields' errors share, see `torchfovea.memory.egosphere.remember`; by default what the
             head's encoders get wrong.
 
     Differentiable in the correspondences. Where only some of the receptive fields were looked through, each stands for

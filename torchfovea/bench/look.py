@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchfovea.correspondence import Correspondences
 from torchfovea.gaussian import columns
-from torchfovea.geometric import correspond_points
-from torchfovea.head import Eyes, eyes, fixate, to_ego
 from torchfovea.perception import Mind, Observer, new_mind
+from torchfovea.sensing.correspondence import Correspondences
+from torchfovea.sensing.geometric import correspond_points
+from torchfovea.sensing.head import Eyes, eyes, fixate, to_ego
 
 __all__ = ["Saccade", "batch_of", "flat_of", "moved_to", "part_of", "saccade", "shares", "support_of"]
 

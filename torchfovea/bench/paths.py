@@ -10,18 +10,18 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from torchfovea.association import Pairs, associate, gather_columns
 from torchfovea.bench import peers
 from torchfovea.bench.look import Saccade, flat_of, moved_to, part_of, shares, support_of
 from torchfovea.bench.timing import Growth, Path, Peer, nbytes, same
-from torchfovea.chart import basis
-from torchfovea.egosphere import Prior, belief, fuse, new_egosphere
 from torchfovea.gaussian import Gaussian, columns, pack, unpack
-from torchfovea.nearest import nearest_cell
+from torchfovea.memory.association import Pairs, associate, gather_columns
+from torchfovea.memory.egosphere import Prior, belief, fuse, new_egosphere
+from torchfovea.memory.nearest import nearest_cell
+from torchfovea.memory.pooling import pool, pool_patches
 from torchfovea.perception import new_mind
-from torchfovea.pooling import pool, pool_patches
-from torchfovea.triangulation import Observations, observe
-from torchfovea.unscented import SigmaPoints
+from torchfovea.sensing.chart import basis
+from torchfovea.sensing.triangulation import Observations, observe
+from torchfovea.sensing.unscented import SigmaPoints
 
 __all__ = ["paths_of_look"]
 

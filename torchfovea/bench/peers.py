@@ -14,8 +14,8 @@ import torch
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from torchfovea.head import Eyes, Head
-from torchfovea.unscented import SigmaPoints
+from torchfovea.sensing.head import Eyes, Head
+from torchfovea.sensing.unscented import SigmaPoints
 
 __all__ = [
     "Choice", "Rig", "Seen", "brute_force", "converted", "decide", "filterpy_loop", "fuse_gaussians", "fuse_patches",

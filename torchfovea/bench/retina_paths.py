@@ -14,8 +14,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchfovea.bench.timing import Growth, Path, Peer, nbytes, same
-from torchfovea.layout import LogPolar
-from torchfovea.retina import fovea
+from torchfovea.sensing.layout import LogPolar
+from torchfovea.sensing.retina import fovea
 
 __all__ = ["path_of_retina"]
 

@@ -13,12 +13,12 @@ from torch import Tensor
 from torchfovea.bench import peers
 from torchfovea.bench.look import Saccade, batch_of, flat_of, moved_to, part_of, saccade, shares, support_of
 from torchfovea.bench.timing import Growth, Path, Peer, nbytes, same
+from torchfovea.deciding.strategies import upper_confidence_bound
 from torchfovea.gaussian import columns, unpack
 from torchfovea.perception import Mind, Observer, decide, new_mind, perceive
+from torchfovea.sensing.triangulation import observe
+from torchfovea.sensing.unscented import SigmaPoints
 from torchfovea.setting import require
-from torchfovea.strategies import upper_confidence_bound
-from torchfovea.triangulation import observe
-from torchfovea.unscented import SigmaPoints
 
 __all__ = ["batched_steps", "paths_of_steps"]
 

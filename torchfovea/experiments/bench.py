@@ -20,14 +20,14 @@ from torchfovea.bench.paths import paths_of_look
 from torchfovea.bench.retina_paths import path_of_retina
 from torchfovea.bench.steps import batched_steps, paths_of_steps
 from torchfovea.bench.timing import Path, Peer, Timing, copy_bandwidth, interleaved, same, slope
-from torchfovea.camera import image_camera
 from torchfovea.config import run_folder
 from torchfovea.experiments.build import build_cells, build_observer, build_scene_of, choice, number, whole
 from torchfovea.experiments.rollout import roll_out
 from torchfovea.files import write_csv, write_result
-from torchfovea.head import Gaze, eyes
-from torchfovea.layout import LogPolar
 from torchfovea.perception import Observer
+from torchfovea.sensing.camera import image_camera
+from torchfovea.sensing.head import Gaze, eyes
+from torchfovea.sensing.layout import LogPolar
 from torchfovea.setting import require
 from torchfovea.sim import gl, rays
 from torchfovea.tuning.scenes import Distribution, draw_scenes

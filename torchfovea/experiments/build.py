@@ -9,22 +9,22 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from torchfovea import sphere
-from torchfovea.camera import Camera, Fisheye, Pinhole
-from torchfovea.correspondence import Budget
-from torchfovea.egosphere import Fusion, Prior
-from torchfovea.external import External
-from torchfovea.head import Head, fixate
-from torchfovea.layout import LogPolar, Retina, Uniform
-from torchfovea.matchers import Matcher
+from torchfovea.memory import sphere
+from torchfovea.memory.egosphere import Fusion, Prior
 from torchfovea.perception import Eligibility, Observer
+from torchfovea.sensing.camera import Camera, Fisheye, Pinhole
+from torchfovea.sensing.correspondence import Budget
+from torchfovea.sensing.head import Head, fixate
+from torchfovea.sensing.layout import LogPolar, Retina, Uniform
+from torchfovea.sensing.unscented import SigmaPoints
 from torchfovea.setting import SettingError, require
-from torchfovea.sgbm import SGBM
 from torchfovea.sim.arena import Arena
 from torchfovea.sim.scene import AttentionWorld, Cans, Room, Scene, build_scene
 from torchfovea.sim.world import World
-from torchfovea.sweep import Sweep
-from torchfovea.unscented import SigmaPoints
+from torchfovea.stereo.external import External
+from torchfovea.stereo.matchers import Matcher
+from torchfovea.stereo.sgbm import SGBM
+from torchfovea.stereo.sweep import Sweep
 
 __all__ = [
     "build_arena",

@@ -16,17 +16,17 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from torch import Tensor
 
-from torchfovea.calibration import Judged, Likelihood, concatenate, fit_budget, judge, select, sigma_of
 from torchfovea.config import run_folder
-from torchfovea.correspondence import Budget
 from torchfovea.experiments.build import build_matcher, build_scene_of, build_sensor, choice, construct, whole
 from torchfovea.experiments.truths import Truths, look_at_pair, look_at_world
 from torchfovea.files import replacing, write_csv, write_result
-from torchfovea.head import Gaze, Head, fixate
-from torchfovea.matchers import Matcher
+from torchfovea.sensing.correspondence import Budget
+from torchfovea.sensing.head import Gaze, Head, fixate
 from torchfovea.setting import SettingError, require
 from torchfovea.sim.scene import Scene
 from torchfovea.sim.world import World
+from torchfovea.stereo.matchers import Matcher
+from torchfovea.studies.calibration import Judged, Likelihood, concatenate, fit_budget, judge, select, sigma_of
 
 __all__ = ["BIN_COLUMNS", "random_gazes", "run"]
 
@@ -86,7 +86,7 @@ def run(cfg: DictConfig) -> float:
     figures |= {"fit.outlier_share": fit.outlier_share, "fit.loss": fit.loss, "fit.first_loss": fit.first_loss}
     _write_budget(folder / "budget" / "fitted.yaml", numbers, cfg, fit.outlier_share)
     write_csv(folder / "bins.csv", BIN_COLUMNS, _bins(data, models, *edges))
-    from torchfovea.pictures_calibration import draw_calibration
+    from torchfovea.pictures.calibration import draw_calibration
 
     draw_calibration(
         folder / "calibration.png",
@@ -204,7 +204,7 @@ def _write_budget(path: Path, numbers: dict[str, float], cfg: DictConfig, outlie
     real = ", the left half of a real pair" if cfg.real else ""
     simulated = f"{cfg.scenes} scenes {cfg.scene.name}, {cfg.looks} looks each" if cfg.scenes else "no simulation"
     lines = [
-        "# An error budget fitted by torchfovea calibrate; torchfovea.correspondence.Budget says what the numbers are.",
+        "# Fitted by torchfovea calibrate; torchfovea.sensing.correspondence.Budget says what the numbers are.",
         f"# Fitted on: {simulated}{real}; {cfg.sensor.layout}, {cfg.sensor.fov_deg:g} degrees, "
         f"source {cfg.sensor.source_px} px, matcher {cfg.matcher.name}",
         f"# Taken for outliers: {outliers:.2%}",

@@ -15,11 +15,11 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 
 from torchfovea.config import conf_dir
+from torchfovea.deciding.strategies import upper_confidence_bound
 from torchfovea.episode import Episode
 from torchfovea.experiments.build import build_observer, whole
 from torchfovea.experiments.rollout import batched, one_episode, roll_out
 from torchfovea.setting import require
-from torchfovea.strategies import upper_confidence_bound
 
 __all__ = ["METRICS", "Task", "cells_of", "regret_convergence", "run_task", "task_name"]
 

@@ -15,7 +15,15 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from torch import Tensor
 
-from torchfovea.characterization import (
+from torchfovea.config import run_folder
+from torchfovea.experiments.build import build_sensor, construct, number, whole
+from torchfovea.experiments.honesty import CHUNK, plan_cases, plan_planes, propagate, realise, wholes
+from torchfovea.experiments.manifest import finished
+from torchfovea.files import write_csv, write_result
+from torchfovea.sensing.correspondence import Budget
+from torchfovea.sensing.layout import LogPolar, Uniform
+from torchfovea.setting import require
+from torchfovea.studies.characterization import (
     Characterization,
     PlaneSensor,
     characterize_planes,
@@ -24,14 +32,6 @@ from torchfovea.characterization import (
     plane_information,
     spread_over_vergence,
 )
-from torchfovea.config import run_folder
-from torchfovea.correspondence import Budget
-from torchfovea.experiments.build import build_sensor, construct, number, whole
-from torchfovea.experiments.honesty import CHUNK, plan_cases, plan_planes, propagate, realise, wholes
-from torchfovea.experiments.manifest import finished
-from torchfovea.files import write_csv, write_result
-from torchfovea.layout import LogPolar, Uniform
-from torchfovea.setting import require
 
 __all__ = ["ADVANTAGE_COLUMNS", "FIG5_COLUMNS", "run"]
 
@@ -219,7 +219,7 @@ def _fig5_figures(
 
 
 def _write_advantage(folder: Path, distance: Tensor, vergence: Tensor, advantage: dict[str, Advantage]) -> None:
-    from torchfovea.pictures_sensor import draw_advantage
+    from torchfovea.pictures.sensor import draw_advantage
 
     rows = []
     for name, values in advantage.items():
@@ -239,7 +239,7 @@ def _draw(
     layouts: dict[str, LogPolar | Uniform],
     sensor: PlaneSensor,
 ) -> None:
-    from torchfovea.pictures_sensor import draw_fig5, draw_layouts
+    from torchfovea.pictures.sensor import draw_fig5, draw_layouts
 
     fields = sensor.retina.receptive_fields
     title = (

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from torchfovea.setting import require
-from torchfovea.significance import bootstrap_interval, holm, sign_flip_p_value
+from torchfovea.studies.significance import bootstrap_interval, holm, sign_flip_p_value
 
 __all__ = ["Claim", "Verdict", "judge", "read_claims", "select"]
 

@@ -7,15 +7,15 @@ from typing import Any
 
 import torch
 
-from torchfovea.camera import Pinhole
-from torchfovea.characterization import (
+from torchfovea.sensing.camera import Pinhole
+from torchfovea.sensing.layout import LogPolar, Retina, Uniform
+from torchfovea.studies.characterization import (
     PlaneSensor,
     characterize_planes,
     matched_vergence,
     peak_vergence,
     spread_over_vergence,
 )
-from torchfovea.layout import LogPolar, Retina, Uniform
 
 __all__ = ["Fig5", "judge_fig5"]
 

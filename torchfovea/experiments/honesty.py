@@ -12,14 +12,27 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from torchfovea.characterization import PlaneSensor, matched_vergence
 from torchfovea.experiments.build import construct, whole
 from torchfovea.files import write_csv
-from torchfovea.propagation import StereoCases, compare_gaussians, first_order, sample_moments, stereo_cases, unscented
-from torchfovea.realised import look_at_plane, off_lattice_distances, pool_sights, realised_information, rings_of_error
+from torchfovea.sensing.unscented import SigmaPoints
 from torchfovea.setting import require
-from torchfovea.sgbm import SGBM
-from torchfovea.unscented import SigmaPoints
+from torchfovea.stereo.sgbm import SGBM
+from torchfovea.studies.characterization import PlaneSensor, matched_vergence
+from torchfovea.studies.propagation import (
+    StereoCases,
+    compare_gaussians,
+    first_order,
+    sample_moments,
+    stereo_cases,
+    unscented,
+)
+from torchfovea.studies.realised import (
+    look_at_plane,
+    off_lattice_distances,
+    pool_sights,
+    realised_information,
+    rings_of_error,
+)
 
 __all__ = [
     "PROPAGATION_COLUMNS",
@@ -88,7 +101,7 @@ def propagate(
     folder: Path, cases: StereoCases, samples: int, generator: torch.Generator, done: Callable[[], None]
 ) -> dict[str, Any]:
     """Every way of propagation beside Monte Carlo, on the same correspondences; `done` after each CHUNK of samples."""
-    from torchfovea.pictures_sensor import draw_propagation
+    from torchfovea.pictures.sensor import draw_propagation
 
     truth = sample_moments(cases, tuple(GOALS), samples, generator, CHUNK, done)
     rows: list[tuple[Any, ...]] = []
@@ -127,7 +140,7 @@ def realise(
     done: Callable[[], None],
 ) -> dict[str, Any]:
     """Textured planes drawn, matched and measured, at the vergence that meets them."""
-    from torchfovea.pictures_sensor import draw_realised
+    from torchfovea.pictures.sensor import draw_realised
 
     matcher, planes, seed = (
         construct(SGBM, cfg.matcher, "matcher"),

@@ -12,8 +12,8 @@ from torchfovea.experiments.build import build_arena, build_cells, build_observe
 from torchfovea.experiments.memory_moving import study_moving, study_resampling
 from torchfovea.experiments.memory_study import Rows, study_encoders, study_fusion
 from torchfovea.files import write_csv, write_result
+from torchfovea.memory.nearest import neighbour_spacing_rad
 from torchfovea.metrics import near_target
-from torchfovea.nearest import neighbour_spacing_rad
 
 __all__ = ["run"]
 
@@ -29,7 +29,7 @@ def run(cfg: DictConfig) -> float:
     """Draw the configured bias, or run a study; the score is the number of cells near the target, or of rows."""
     if OmegaConf.select(cfg, "study") is not None:
         return _study(cfg, choice(cfg, "study", tuple(STUDIES)))
-    from torchfovea.pictures_memory import draw_memory
+    from torchfovea.pictures.memory import draw_memory
 
     observer, folder, seed = build_observer(cfg), run_folder(), whole(cfg, "seed", 0)
     arena = build_arena(cfg, observer, seed)

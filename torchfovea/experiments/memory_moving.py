@@ -9,14 +9,14 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from torchfovea.egosphere import new_egosphere
 from torchfovea.experiments.build import build_arena, build_cells, build_observer, number, whole
 from torchfovea.experiments.memory_study import COLUMNS, Rows, estimate, figures_of, fixation_course, judge_cells
-from torchfovea.head import Gaze, eyes, fixate
+from torchfovea.memory.egosphere import new_egosphere
+from torchfovea.memory.moving import Motion, motion, move, resample
+from torchfovea.memory.nearest import build_index, neighbour_spacing_rad
 from torchfovea.metrics import gap
-from torchfovea.moving import Motion, motion, move, resample
-from torchfovea.nearest import build_index, neighbour_spacing_rad
 from torchfovea.perception import Mind, Observer, decide, new_mind, perceive
+from torchfovea.sensing.head import Gaze, eyes, fixate
 from torchfovea.sim.arena import Arena
 from torchfovea.sim.scene import EgoPose, stand_at
 from torchfovea.sim.world import World

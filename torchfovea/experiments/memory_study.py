@@ -11,17 +11,17 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from torchfovea.chart import basis
-from torchfovea.egosphere import Fusion, Prior, belief
 from torchfovea.experiments.build import build_arena, build_cells, build_observer, whole
 from torchfovea.gaussian import quadratic3
-from torchfovea.head import Gaze, eyes, fixate
-from torchfovea.layout import LogPolar, Retina, Uniform
-from torchfovea.nearest import neighbour_spacing_rad
+from torchfovea.memory.egosphere import Fusion, Prior, belief
+from torchfovea.memory.nearest import neighbour_spacing_rad
 from torchfovea.perception import Mind, Observer, new_mind, perceive
+from torchfovea.sensing.chart import basis
+from torchfovea.sensing.head import Gaze, eyes, fixate
+from torchfovea.sensing.layout import LogPolar, Retina, Uniform
+from torchfovea.sensing.unscented import SigmaPoints
 from torchfovea.sim.arena import Arena
 from torchfovea.sim.world import World
-from torchfovea.unscented import SigmaPoints
 
 __all__ = [
     "Judge",

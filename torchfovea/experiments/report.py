@@ -10,10 +10,11 @@ from typing import Any
 
 import torch
 
-from torchfovea import __version__, pictures_reproduce
+from torchfovea import __version__
 from torchfovea.experiments.claims import select
 from torchfovea.files import replacing, write_csv
-from torchfovea.significance import bootstrap_interval
+from torchfovea.pictures import reproduce as pictures_reproduce
+from torchfovea.studies.significance import bootstrap_interval
 
 __all__ = ["write_report"]
 

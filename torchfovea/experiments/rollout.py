@@ -12,16 +12,16 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from torchfovea.arena import Look, Truth, stack
+from torchfovea.deciding.strategies import Strategy
 from torchfovea.episode import Episode, run_episode, run_episodes, stack_minds
 from torchfovea.experiments.build import build_arena, build_cells, build_scene_of, number, whole
 from torchfovea.experiments.strategy import build_stop, build_strategy
-from torchfovea.head import Head
 from torchfovea.perception import Mind, Observer, Step, new_mind
+from torchfovea.sensing.head import Head
 from torchfovea.setting import require
 from torchfovea.sim.arenas import GeometricArenas
 from torchfovea.sim.model import Scene
 from torchfovea.sim.truth import truth_of
-from torchfovea.strategies import Strategy
 
 __all__ = ["batched", "one_episode", "prepare", "roll_out", "sample_of"]
 

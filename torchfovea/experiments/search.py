@@ -159,7 +159,7 @@ def summarize(rows: list[tuple[Any, ...]]) -> dict[str, Any]:
 
 
 def _draw(folder: Path, cfg: DictConfig, retina: Any, episode: Episode, row: tuple[Any, ...]) -> None:
-    from torchfovea.pictures import draw_episode
+    from torchfovea.pictures.episode import draw_episode
 
     moves = row[EPISODE_COLUMNS.index("saccades_to_target")]
     outcome = f"target fixated after {moves} saccades" if bool(episode.hit.any()) else "target not found"

@@ -12,25 +12,25 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from torchfovea.camera import Pinhole
-from torchfovea.chart import cartesian_from_inverse_range
 from torchfovea.config import run_folder
-from torchfovea.correspondence import Budget
-from torchfovea.disparity_files import load_disparity
 from torchfovea.experiments.build import build_matcher, build_sensor, choice, construct, number, whole
 from torchfovea.experiments.images import read_image, write_ply
 from torchfovea.files import replacing, write_result
 from torchfovea.gaussian import Gaussian
-from torchfovea.head import Eyes
-from torchfovea.layout import Retina
-from torchfovea.matchers import Matcher, match_pair
 from torchfovea.metrics import coverage, nees_mean, outlier_share
-from torchfovea.rectified import RectifiedMatch, match_disparity
-from torchfovea.retina import fovea
+from torchfovea.sensing.camera import Pinhole
+from torchfovea.sensing.chart import cartesian_from_inverse_range
+from torchfovea.sensing.correspondence import Budget
+from torchfovea.sensing.head import Eyes
+from torchfovea.sensing.layout import Retina
+from torchfovea.sensing.retina import fovea
+from torchfovea.sensing.triangulation import Observations, observe
+from torchfovea.sensing.unscented import SigmaPoints
 from torchfovea.setting import SettingError, require
-from torchfovea.sgbm import SGBM
-from torchfovea.triangulation import Observations, observe
-from torchfovea.unscented import SigmaPoints
+from torchfovea.stereo.disparity_files import load_disparity
+from torchfovea.stereo.matchers import Matcher, match_pair
+from torchfovea.stereo.rectified import RectifiedMatch, match_disparity
+from torchfovea.stereo.sgbm import SGBM
 
 __all__ = ["Pair", "Sensed", "load_pair", "motorcycle", "run", "sense"]
 
@@ -93,7 +93,7 @@ def run(cfg: DictConfig) -> float | None:
             again = _at(pair, plain.disparity, plain.valid, retina, gaze_px, budget)
             figures.update(_beside(pair, sensed, again, retina, gaze_px))
     _write(folder, sensed)
-    from torchfovea.pictures import draw_sense
+    from torchfovea.pictures.episode import draw_sense
 
     draw_sense(
         folder / "sense.png", pair.left, sensed.match.disparity, sensed.observed, sensed.match.correspondences.left_px

@@ -10,10 +10,10 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from torchfovea import strategies
+from torchfovea.deciding import strategies
+from torchfovea.deciding.strategies import Strategy
 from torchfovea.perception import Observer
 from torchfovea.setting import require
-from torchfovea.strategies import Strategy
 
 __all__ = ["STRATEGIES", "StopRule", "build_stop", "build_strategy", "read_number"]
 

@@ -9,20 +9,20 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from torchfovea.calibration import Judged, judged
-from torchfovea.camera import Camera
-from torchfovea.confidence import read_clues
-from torchfovea.correspondence import Budget, Clues, Correspondences, Disparity
 from torchfovea.experiments.build import build_sensor
 from torchfovea.experiments.sense import load_pair
-from torchfovea.head import Eyes, Gaze, eyes
-from torchfovea.layout import Retina
-from torchfovea.matchers import Matcher, match_eyes, match_pair
-from torchfovea.rectified import match_disparity
-from torchfovea.rig import verged
+from torchfovea.sensing.camera import Camera
+from torchfovea.sensing.correspondence import Budget, Clues, Correspondences, Disparity
+from torchfovea.sensing.head import Eyes, Gaze, eyes
+from torchfovea.sensing.layout import Retina
 from torchfovea.setting import SettingError, require
 from torchfovea.sim.world import World
-from torchfovea.sweep import Sweep
+from torchfovea.stereo.confidence import read_clues
+from torchfovea.stereo.matchers import Matcher, match_eyes, match_pair
+from torchfovea.stereo.rectified import match_disparity
+from torchfovea.stereo.rig import verged
+from torchfovea.stereo.sweep import Sweep
+from torchfovea.studies.calibration import Judged, judged
 
 __all__ = ["Truths", "look_at_pair", "look_at_world"]
 

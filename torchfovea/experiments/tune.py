@@ -20,9 +20,9 @@ from torchfovea.experiments.build import build_observer, construct, number, whol
 from torchfovea.experiments.manifest import finished
 from torchfovea.experiments.tune_study import check_study, study_curves, study_gradients
 from torchfovea.files import replacing, write_csv, write_result
+from torchfovea.memory.sphere import direction_mixture, sphere_quadrature
 from torchfovea.setting import require
-from torchfovea.significance import bootstrap_interval
-from torchfovea.sphere import direction_mixture, sphere_quadrature
+from torchfovea.studies.significance import bootstrap_interval
 from torchfovea.tuning.baselines import TABLE_1, hand, table_1
 from torchfovea.tuning.bias import Shape, decode, encode, fov_of, mixture_of, reachable
 from torchfovea.tuning.prior_field import fit_by_gradient, fit_closed_form
@@ -158,7 +158,7 @@ def _run(cfg: DictConfig) -> float:
         rows = study_curves(cfg, problem, start, schedule, heldout, folder, figures)
     if cfg.study == "gradients":
         checks = study_gradients(cfg, problem, start, state, sizes["check_episodes"], folder)
-    from torchfovea.pictures_tuning import draw_tuning
+    from torchfovea.pictures.tuning import draw_tuning
 
     draw_tuning(folder, problem, start, state, checks, rows)
     write_csv(folder / "tuning.csv", ("episodes", "validation"), [(e, v) for e, v, _ in state.history])

@@ -9,15 +9,15 @@ import torch
 from torch import Tensor
 
 from torchfovea.arena import Fixation, Look, Move, Truth
-from torchfovea.correspondence import Correspondences, Disparity
-from torchfovea.geometric import correspond_points
-from torchfovea.head import Gaze, eyes
-from torchfovea.matchers import Matcher, match_eyes
 from torchfovea.perception import Observer
-from torchfovea.rig import verged
+from torchfovea.sensing.correspondence import Correspondences, Disparity
+from torchfovea.sensing.geometric import correspond_points
+from torchfovea.sensing.head import Gaze, eyes
 from torchfovea.sim.truth import truth_of
 from torchfovea.sim.world import World
-from torchfovea.sweep import SweepRange
+from torchfovea.stereo.matchers import Matcher, match_eyes
+from torchfovea.stereo.rig import verged
+from torchfovea.stereo.sweep import SweepRange
 
 __all__ = ["Arena", "Pictures", "draw_fields"]
 

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from torchfovea.arena import Fixation, Look, Move
-from torchfovea.geometric import correspond_points
-from torchfovea.head import Gaze, clamp_gaze, cyclopean, eyes, to_ego
 from torchfovea.perception import Observer
+from torchfovea.sensing.geometric import correspond_points
+from torchfovea.sensing.head import Gaze, clamp_gaze, cyclopean, eyes, to_ego
 from torchfovea.sim.arena import draw_fields
 from torchfovea.sim.model import Scene
 from torchfovea.sim.motor import InstantMotor

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from torchfovea.head import Gaze, Head, cyclopean, eyes, fixate
+from torchfovea.sensing.head import Gaze, Head, cyclopean, eyes, fixate
 from torchfovea.setting import SettingError, require
 from torchfovea.sim.model import Scene
 from torchfovea.sim.rays import cast

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfovea.camera import Camera, Pinhole
+from torchfovea.sensing.camera import Camera, Pinhole
 from torchfovea.setting import SettingError, require
 from torchfovea.sim.backend import load_mujoco, loadable_gl
 from torchfovea.sim.model import Scene

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from torchfovea.head import Head
+from torchfovea.sensing.head import Head
 
 __all__ = ["ACTUATORS", "CAMERAS", "JOINTS", "add_head"]
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfovea.head import Head
+from torchfovea.sensing.head import Head
 from torchfovea.sim.room import FLOOR, TARGET, Solid
 from torchfovea.sim.texture import Paint
 

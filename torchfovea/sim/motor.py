@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import torch
 
-from torchfovea.head import Gaze, Head, cyclopean
+from torchfovea.sensing.head import Gaze, Head, cyclopean
 from torchfovea.setting import require
 
 __all__ = ["InstantMotor", "Moved", "turned_deg"]

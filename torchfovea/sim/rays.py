@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfovea.camera import Camera
+from torchfovea.sensing.camera import Camera
 from torchfovea.setting import require
 from torchfovea.sim.backend import load_mujoco
 from torchfovea.sim.model import Scene
@@ -169,7 +169,7 @@ def render(scene: Scene, R: Tensor, t: Tensor, camera: Camera, size_px: int) -> 
         scene: what to look at.
         R: (3, 3), columns are the camera's axes in E.
         t: (3,), the camera's centre in E [m].
-        camera: of the image (`torchfovea.camera.image_camera`); pixel centres are integers.
+        camera: of the image (`torchfovea.sensing.camera.image_camera`); pixel centres are integers.
         size_px: side of the picture, >= 2.
 
     Raises:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from torchfovea.head import Head
+from torchfovea.sensing.head import Head
 from torchfovea.setting import require
 from torchfovea.sim.backend import load_mujoco
 from torchfovea.sim.head_model import add_head

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
-from torchfovea.head import Head
+from torchfovea.sensing.head import Head
 from torchfovea.setting import require
 from torchfovea.sim.backend import load_mujoco
 from torchfovea.sim.cans import Cans, place_cans, target_in_sight

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchfovea.head import Gaze, Head
+from torchfovea.sensing.head import Gaze, Head
 from torchfovea.setting import SettingError, require
 from torchfovea.sim.backend import load_mujoco
 from torchfovea.sim.head_model import JOINTS

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.arena import Truth
-from torchfovea.head import Head, fixate
+from torchfovea.sensing.head import Head, fixate
 from torchfovea.sim.model import Nearest, Scene
 from torchfovea.sim.rays import RayHits, cast
 

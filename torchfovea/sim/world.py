@@ -7,8 +7,8 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from torchfovea.camera import Camera, Pinhole, image_camera
-from torchfovea.head import Gaze, Head, clamp_gaze, cyclopean, eyes, to_ego
+from torchfovea.sensing.camera import Camera, Pinhole, image_camera
+from torchfovea.sensing.head import Gaze, Head, clamp_gaze, cyclopean, eyes, to_ego
 from torchfovea.setting import require
 from torchfovea.sim.gl import available_gl
 from torchfovea.sim.gl import render as render_gl

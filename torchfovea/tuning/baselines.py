@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfovea.sphere import direction_mixture
+from torchfovea.memory.sphere import direction_mixture
 from torchfovea.tuning.bias import Shape, encode, features, fix_vector
 from torchfovea.tuning.problem import Problem, evaluate, play_each
 from torchfovea.tuning.scenes import Distribution, stream

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchfovea.head import Head, fixate
+from torchfovea.memory.sphere import DirectionMixture, Quadrature, deep_tail, fix_gauge, log_radial_moment
+from torchfovea.sensing.head import Head, fixate
 from torchfovea.setting import require
-from torchfovea.sphere import DirectionMixture, Quadrature, deep_tail, fix_gauge, log_radial_moment
 
 __all__ = [
     "Bias", "Shape", "decode", "draw_cells", "encode", "features", "fix_vector", "fov_of", "log_density_each",
@@ -265,7 +265,7 @@ def _normal(seed: Tensor, counter: Tensor, dtype: torch.dtype) -> tuple[Tensor, 
 
 
 def log_density_each(bias: Bias, directions: Tensor) -> Tensor:
-    """`torchfovea.sphere.log_density` of a batch of mixtures, each at its own directions.
+    """`torchfovea.memory.sphere.log_density` of a batch of mixtures, each at its own directions.
 
     Args:
         bias: B mixtures (or one for all).

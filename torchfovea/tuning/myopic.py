@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from torchfovea.head import Gaze, eyes, fixate
 from torchfovea.metrics import gap
+from torchfovea.sensing.head import Gaze, eyes, fixate
 from torchfovea.setting import require
 from torchfovea.tuning.bias import draw_cells, log_density_each, log_normalizer_each
 from torchfovea.tuning.estimators import Credit, Gradient, finish

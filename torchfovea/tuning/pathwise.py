@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchfovea.head import eyes, fixate
+from torchfovea.sensing.head import eyes, fixate
 from torchfovea.tuning.bias import draw_cells, reachable
 from torchfovea.tuning.estimators import Gradient, alpha_difference
 from torchfovea.tuning.problem import Batch, Problem, prepare

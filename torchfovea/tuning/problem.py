@@ -12,9 +12,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchfovea.camera import Pinhole
+from torchfovea.memory.sphere import Quadrature, sphere_quadrature
+from torchfovea.sensing.camera import Pinhole
 from torchfovea.setting import SettingError, require
-from torchfovea.sphere import Quadrature, sphere_quadrature
 from torchfovea.tuning.bias import Bias, Shape, decode, draw_cells, fov_of, reachable
 from torchfovea.tuning.prior_field import PriorField, look_up
 from torchfovea.tuning.scenes import Distribution, Scenes, draw_scenes

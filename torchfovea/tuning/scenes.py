@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.gaussian import columns
-from torchfovea.head import Head, fixate
+from torchfovea.sensing.head import Head, fixate
 from torchfovea.setting import require
 
 __all__ = ["Distribution", "Hits", "Scenes", "cast", "draw_scenes", "nearest_point", "stream"]

@@ -4,7 +4,7 @@ In a saccade each cell that both retinas see gets *one* noisy inverse range, mea
 scalar Gaussian belief of it. Removing or adding a cell changes no other cell's observations, which is what makes the
 counterfactual gradient exact here. Against the full simulator there is no occlusion between the eyes, no poles and no
 furniture, no pooling of receptive fields and no patch scatter; the standard deviation of an observation is that of
-`torchfovea.triangulation.observe` to first order.
+`torchfovea.sensing.triangulation.observe` to first order.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchfovea.acquisition import upper_confidence_bound
-from torchfovea.camera import Pinhole
-from torchfovea.correspondence import eye_sigma_px
+from torchfovea.deciding.acquisition import upper_confidence_bound
+from torchfovea.deciding.reward import RewardBelief, range_from_inverse_range
 from torchfovea.gaussian import columns
-from torchfovea.head import Eyes, Gaze, cyclopean, eyes, fixate, rig_frame
 from torchfovea.metrics import gap
 from torchfovea.perception import Observer
-from torchfovea.reward import RewardBelief, range_from_inverse_range
+from torchfovea.sensing.camera import Pinhole
+from torchfovea.sensing.correspondence import eye_sigma_px
+from torchfovea.sensing.head import Eyes, Gaze, cyclopean, eyes, fixate, rig_frame
 from torchfovea.setting import require
 from torchfovea.tuning.scenes import Scenes, cast
 
@@ -135,8 +135,8 @@ def glance(observer: Observer, pose: Eyes, point: Tensor, direction: Tensor, ran
     """Which points both retinas see, and the variance of their inverse range, to first order.
 
     In the rig's frame, with slopes u = x/z and v = y/z of the eyes' rays, the point is Z ((u + u')/2, (v + v')/2, 1)
-    about the baseline's middle with Z = b/(u − u'), as in `torchfovea.triangulation.triangulate_rectified`; the noise
-    of each retina reaches the slopes through its eye's rotation.
+    about the baseline's middle with Z = b/(u − u'), as in `torchfovea.sensing.triangulation.triangulate_rectified`; the
+    noise of each retina reaches the slopes through its eye's rotation.
 
     Args:
         observer: camera, retina and error budget.

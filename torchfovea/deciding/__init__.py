@@ -1,0 +1,1 @@
+"""Rewards and where to look next (Sec. 6)."""

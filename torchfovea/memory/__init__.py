@@ -1,0 +1,1 @@
+"""The sensory ego-sphere: cells, association, fusion (Sec. 5)."""

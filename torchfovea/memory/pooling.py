@@ -1,0 +1,190 @@
+"""One saccade's observations added up, cell by cell, before they join the memory (Sec. 5.3)."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchfovea.gaussian import Gaussian, Information, columns, information_from_gaussian, inverse3, times3
+from torchfovea.memory.association import Pairs, in_front
+from torchfovea.sensing.chart import basis
+from torchfovea.sensing.triangulation import Observations
+
+__all__ = ["Pooled", "add_common", "found_points", "nearness", "pool", "pool_in_front", "pool_patches"]
+
+
+class Pooled(NamedTuple):
+    """What one saccade tells about each cell.
+
+    Attributes:
+        information: (..., Nx, 3) and (..., Nx, 6), zero where nothing came.
+        bearing: see `EgoSphere`, (..., Nx).
+        hits: number of observations (..., Nx).
+    """
+
+    information: Information
+    bearing: Tensor
+    hits: Tensor
+
+
+def _sum_up(parts: list[Tensor], cell: Tensor, batch: torch.Size, cells: int) -> Pooled:
+    """Add up ten or eleven components (M,): vector, matrix, perhaps bearing, count."""
+    rows = torch.stack(parts)
+    total = torch.zeros(len(parts), batch.numel() * cells, dtype=rows.dtype, device=rows.device)
+    total = total.scatter_add(1, cell.expand(len(parts), -1), rows)
+    total = total.reshape(len(parts), *batch, cells).movedim(0, -1)
+    bearing = total[..., 9] if len(parts) == 11 else torch.zeros_like(total[..., 9])
+    return Pooled(Information(total[..., :3], total[..., 3:9]), bearing, total[..., -1])
+
+
+def pool(gaussian: Gaussian, cell: Tensor, batch: torch.Size, cells: int) -> Pooled:
+    """Add up the information of one saccade's points, cell by cell (Eq. 34-35 without the memory).
+
+    Args:
+        gaussian: (M, 3) and (M, 6), points in E.
+        cell: (M,) int64, counted through all batches.
+        batch: leading axes of the memory.
+        cells: Nx.
+
+    Differentiable in the Gaussians.
+    """
+    vector, matrix = information_from_gaussian(gaussian)
+    parts = [*vector.unbind(-1), *matrix.unbind(-1), torch.ones_like(vector[..., 0])]
+    return _sum_up(parts, cell, batch, cells)
+
+
+def pool_patches(
+    rho: Tensor,
+    variance: Tensor,
+    bearing: Tensor,
+    row: Tensor,
+    keep: Tensor,
+    cell: Tensor,
+    batch: torch.Size,
+    cells: int,
+) -> Pooled:
+    """Add up the information of one saccade's inverse ranges about the patches that they fall on.
+
+    Args:
+        rho: observed inverse ranges (M,) [1/m].
+        variance: theirs (M,).
+        bearing: precision of their directions (M,) [1/rad²].
+        row: their directions in their cells' frames (e₁, e₂, p), (M, 3).
+        keep: how often each counts, 1 or 0, (M,).
+        cell: (M,) int64, counted through all batches.
+        batch: leading axes of the memory.
+        cells: Nx.
+
+    Differentiable in all but the cells.
+    """
+    x, y, z = row.unbind(-1)
+    weight = keep / variance
+    wx, wy, wz = weight * x, weight * y, weight * z
+    parts = [wx * rho, wy * rho, wz * rho, wx * x, wx * y, wx * z, wy * y, wy * z, wz * z, keep * bearing]
+    return _sum_up([*parts, keep], cell, batch, cells)
+
+
+def pool_in_front(
+    observed: Observations,
+    direction: Tensor,
+    target: Tensor,
+    pairs: Pairs,
+    cells: Tensor,
+    conflict: float,
+    slope_std: float,
+) -> Pooled:
+    """Pool one saccade's inverse ranges, without those that another of the same cell hides from E.
+
+    Args:
+        observed: (..., N), in inverse range.
+        direction: of the observations in pairs (M, 3).
+        target: their cells' directions (M, 3).
+        pairs: from `torchfovea.memory.association.associate`.
+        cells: of the memory (..., Nx, 3).
+        conflict: how many standard deviations apart two surfaces are two; inf: all count.
+        slope_std: how steep patches may be [1/m/rad].
+
+    Differentiable in the observations; which are hidden is held fixed.
+    """
+    aa, _, _, bb, _, rr = (part.reshape(-1).index_select(0, pairs.observation) for part in observed.cov.unbind(-1))
+    rho = observed.mean[..., 2].reshape(-1).index_select(0, pairs.observation)
+    across = aa + bb
+    # seen in a direction that is itself uncertain: on a slope the inverse range is so too
+    variance = rr + slope_std**2 * across
+    row = columns(*((direction * axis).sum(-1) for axis in (*basis(target), target)))
+    batch, count = cells.shape[:-2], cells.shape[-2]
+    keep = torch.ones_like(rho)
+    if conflict < math.inf:
+        with torch.no_grad():
+            off = row[..., 0] ** 2 + row[..., 1] ** 2
+            std = (variance + slope_std**2 * off).sqrt()
+            keep = in_front(rho, std, pairs.cell, batch.numel() * count, conflict).to(rho.dtype)
+    return pool_patches(rho, variance, 2 / across, row, keep, pairs.cell, batch, count)
+
+
+def add_common(pooled: Pooled, common: Tensor, chart: str, slope_std: float = 0.0) -> Pooled:
+    """Add a covariance that all observations of the saccade share (encoder errors) to the pooled one.
+
+    Args:
+        pooled: from `pool` or `pool_patches`.
+        common: packed covariance (..., Nx, 6): of (x, y, z), or of (a, b, ρ) at the cells.
+        chart: of the memory.
+        slope_std: patches only: how steep they may be, see `Prior`. A common bearing error shifts what lies on a slope.
+
+    Differentiable.
+    """
+    seen = (pooled.hits > 0)[..., None]
+    vector, matrix = pooled.information
+    if chart == "cartesian":
+        one = columns(*(torch.full_like(pooled.hits, float(k in (0, 3, 5))) for k in range(6)))
+        cov = inverse3(torch.where(seen, matrix, one))
+        mean = times3(cov, vector)
+        matrix = torch.where(seen, inverse3(cov + common), matrix)
+        return pooled._replace(information=Information(torch.where(seen, times3(matrix, mean), vector), matrix))
+    aa, _, _, bb, _, rr = common.unbind(-1)
+    variance = rr + slope_std**2 * (aa + bb)
+    # (Λ⁻¹ + v e eᵀ)⁻¹ = Λ − v Λe (Λe)ᵀ/(1 + v eᵀΛe), e the axis of ρ: good for a singular Λ too
+    xz, yz, zz = matrix[..., 2], matrix[..., 4], matrix[..., 5]
+    scale = variance / (1 + variance * zz)
+    outer = columns(xz * xz, xz * yz, xz * zz, yz * yz, yz * zz, zz * zz)
+    less = scale * vector[..., 2]
+    information = Information(
+        vector - columns(less * xz, less * yz, less * zz), matrix - columns(*(scale * o for o in outer.unbind(-1)))
+    )
+    bearing = pooled.bearing / (1 + pooled.bearing * (aa + bb) / 2)
+    return pooled._replace(information=information, bearing=bearing)
+
+
+def nearness(information: Information, slope: float = 0.0, weak: Tensor | float = 0.0) -> tuple[Tensor, Tensor]:
+    """Mean and variance (...) of patches' inverse range at their cells, from their information.
+
+    Args:
+        information: of patches (g₁, g₂, ρ), (..., 3) and (..., 6).
+        slope: information of each slope to add, which pooled observations may lack.
+        weak: the same of ρ, so that empty cells have finite moments too; broadcastable to (...).
+
+    Differentiable.
+    """
+    x, y, z = information.vector.unbind(-1)
+    xx, xy, xz, yy, yz, zz = information.matrix.unbind(-1)
+    xx, yy = xx + slope, yy + slope
+    scale = 1 / (xx * yy - xy * xy)
+    # the row (xz, yz) times the inverse of the slopes' block
+    a, b = scale * (xz * yy - yz * xy), scale * (yz * xx - xz * xy)
+    variance = 1 / (zz + weak - a * xz - b * yz)
+    return variance * (z - a * x - b * y), variance
+
+
+def found_points(pooled: Pooled, cells: Tensor, chart: str, slope_std: float, far_m: float = 1000.0) -> Tensor:
+    """Where a saccade alone sees each cell's point, (..., Nx, 3) [m]; 1 m out where it saw none."""
+    seen = pooled.hits > 0
+    one, zero = torch.ones_like(pooled.hits), torch.zeros_like(pooled.hits)
+    vector, matrix = pooled.information
+    if chart == "cartesian":
+        safe = torch.where(seen[..., None], matrix, columns(one, zero, zero, one, zero, one))
+        return torch.where(seen[..., None], times3(inverse3(safe), vector), cells)
+    rho = torch.where(seen, nearness(pooled.information, slope_std**-2, torch.where(seen, zero, one))[0], one)
+    return cells / rho.clamp(min=1 / far_m)[..., None]

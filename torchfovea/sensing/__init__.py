@@ -1,0 +1,1 @@
+"""From two retinas to 3-D points with covariances (Sec. 4)."""

@@ -1,0 +1,143 @@
+"""Correspondences between the two retinas and how well each is known: the measurement of paper Eq. 6-7."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchfovea.sensing.camera import Pinhole
+from torchfovea.sensing.retina import Retina
+from torchfovea.setting import require
+
+__all__ = ["Budget", "Clues", "Correspondences", "Disparity", "doubt", "eye_sigma_px"]
+
+
+class Correspondences(NamedTuple):
+    """Pairs of places that show the same point, one for every RF of the left eye; pixels of each eye's own camera.
+
+    Attributes:
+        left_px: (..., N, 2), the RF's centre.
+        right_px: (..., N, 2); finite but meaningless where invalid.
+        left_sigma_px: (..., N), standard deviation along each axis.
+        right_sigma_px: (..., N).
+        valid: bool (..., N).
+    """
+
+    left_px: Tensor
+    right_px: Tensor
+    left_sigma_px: Tensor
+    right_sigma_px: Tensor
+    valid: Tensor
+
+
+class Disparity(NamedTuple):
+    """What the matcher saw and found, in the pixels of the left rectified view.
+
+    Attributes:
+        image: (H, W), the left view in grey, 0 to 1.
+        disparity: (H, W) [px], x_left − x_right; 0 where invalid.
+        valid: bool (H, W).
+        camera: the left view's.
+        doffs_px: disparity of a point at infinity, negated (cx_right − cx_left): depth = focal · baseline/(d + doffs).
+        baseline_m: distance between the eyes.
+    """
+
+    image: Tensor
+    disparity: Tensor
+    valid: Tensor
+    camera: Pinhole
+    doffs_px: float
+    baseline_m: float
+
+    def depth_m(self) -> Tensor:
+        """Depth along the view's axis (H, W) [m]; inf where invalid or not in front."""
+        shift = self.disparity + self.doffs_px
+        seen = self.valid & (shift > 0)
+        depth = self.camera.focal_px * self.baseline_m / torch.where(seen, shift, torch.ones_like(shift))
+        return torch.where(seen, depth, torch.full_like(depth, math.inf))
+
+
+class Clues(NamedTuple):
+    """What a disparity map tells of how far each of its readings can be trusted (`torchfovea.stereo.confidence`).
+
+    Attributes:
+        bend_px: (..., N) [source px], by how much the neighbourhood departs from a plane through the reading: a depth
+            edge, a fine structure, noise. A slant does not count.
+        gap_px: (..., N) [source px], how far the neighbourhood reaches times the share of it that has no disparity.
+    """
+
+    bend_px: Tensor
+    gap_px: Tensor
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What limits a correspondence, as variances that add up: an RF cannot be sharper than its source.
+
+    σ² = (s W)² + (s p)² + (m p)² per eye and axis, with s = `sigma_over_width`, W the RF's width, p the size of a
+    source pixel on the retina and m the matcher's own error: m² = `match_px`² + (`bend`·bend)² + (`gap`·gap)² with the
+    clues of each correspondence, where the matcher gives any. The paper has the first term only: `Budget.printed`.
+    `torchfovea calibrate` fits the numbers (`torchfovea.studies.calibration`).
+
+    Attributes:
+        sigma_over_width: s; 1/6 lets three standard deviations span half a width.
+        source_px: side of the source image across the retina [px]; None leaves out the terms with p.
+        match_px: the matcher's error in each eye on a smooth surface [source px].
+        bend: share of a reading's `Clues.bend_px` that is error; 0: not asked.
+        gap: share of `Clues.gap_px`; 0: not asked.
+        claim: factor on the standard deviation that a matcher itself claims (the sweep's curve of costs, a foreign
+            matcher's confidence).
+    """
+
+    sigma_over_width: float = 1 / 6
+    source_px: int | None = 400
+    match_px: float = 0.15
+    bend: float = 0.0
+    gap: float = 0.0
+    claim: float = 1.0
+
+    printed: ClassVar[Budget]
+
+    def __post_init__(self) -> None:
+        """Raise SettingError for impossible numbers."""
+        require(
+            0 < self.sigma_over_width < math.inf, "sensor.sigma_over_width", self.sigma_over_width, "a positive number"
+        )
+        require(
+            self.source_px is None or self.source_px > 0, "sensor.source_px", self.source_px, "a positive number of px"
+        )
+        require(0 <= self.match_px < math.inf, "sensor.match_px", self.match_px, "0 or more source pixels")
+        for name in ("bend", "gap", "claim"):
+            require(0 <= getattr(self, name) < math.inf, f"budget.{name}", getattr(self, name), "0 or more")
+
+
+Budget.printed = Budget(source_px=None, match_px=0.0)
+
+
+def eye_sigma_px(budget: Budget, retina: Retina, px: Tensor, clues: Clues | None = None) -> Tensor:
+    """Standard deviation along each axis of a correspondence at places of one retina.
+
+    Args:
+        budget: the terms.
+        retina: the layout.
+        px: (..., 2), places [retinal px].
+        clues: of each correspondence (...); None: none.
+
+    Returns:
+        (...) [retinal px]. Differentiable.
+    """
+    source = 0.0 if budget.source_px is None else 2 * retina.radius_px / budget.source_px
+    square = (budget.sigma_over_width * retina.width_px(px)).square()
+    square = square + (budget.sigma_over_width**2 + budget.match_px**2) * source**2
+    if clues is not None and source > 0:
+        square = square + doubt(budget, clues) * source**2
+    return square.sqrt()
+
+
+def doubt(budget: Budget, clues: Clues) -> Tensor:
+    """The variance that the clues (...) add in each eye [source px²]."""
+    return (budget.bend * clues.bend_px).square() + (budget.gap * clues.gap_px).square()

@@ -1,0 +1,320 @@
+"""What a retina sees: images to receptive fields (RFs) and back.
+
+An RF averages what it covers. Averages come from an image pyramid, as in mip-mapping: each level halves the one below
+with the binomial filter (1, 3, 3, 1)/8 along both axes, so that pixel k of level l has its centre at 2ˡk + (2ˡ − 1)/2
+in the image's pixels. An RF that is W image pixels wide is read, bilinearly, at level log₂W − 1, between the two
+nearest levels. What it then weighs spreads over 0.32 W (standard deviation along an axis); a square, over 0.29 W.
+
+Pixel centres are integers; an image's middle is at (size − 1)/2.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from torchfovea.gaussian import columns
+from torchfovea.sensing.layout import LogPolar, Retina, Uniform, cortical
+from torchfovea.setting import require
+
+__all__ = ["LogPolar", "Retina", "Uniform", "cortical", "covered", "fovea", "interpolate", "reconstruct"]
+
+
+class Sampling(NamedTuple):
+    """Where a retina reads an image and its pyramid.
+
+    The P places are, in this order: RFs 0…N−1 at the finer of their two levels, then RFs `first`…N−1, those wide enough
+    to need a coarser one, at that. Layouts list narrow RFs first, so that every group is one slice. Coordinates are as
+    in `grid_sample`: −1…1 over the image for the places before `above`, over the stacked pyramid for the others.
+    """
+
+    levels: int  # above the image
+    first: int  # the first RF that needs two levels
+    above: int  # the first RF that does not read the image itself
+    blend: Tensor  # (N − first,), weight of the coarser level
+    grid: Tensor  # (P, 2), for a gaze at the image's pixel (0, 0)
+    gain: Tensor  # (P, 2), motion of the place per pixel of gaze
+    low: Tensor  # (P, 2), centres of the level's border pixels
+    high: Tensor  # (P, 2)
+    middle: Tensor  # (1, P, 2), the places for a gaze at the image's middle
+
+
+def fovea(image: Tensor, gaze_px: Tensor | None, retina: Retina, scale: float | None = None) -> Tensor:
+    """Look at an image with a retina: every RF's average over its own footprint.
+
+    Args:
+        image: (B, C, H, W), floating point, finite. One image (B = 1) may be looked at with many gazes.
+        gaze_px: (B, 2), the image pixel (column, row) where the optical axis lands; None for the image's middle.
+        retina: the layout.
+        scale: image pixels per retinal pixel; None lets the retina span the image's shorter side.
+
+    Returns:
+        (B, C, N). An RF that looks outside the image gets the nearest border's value; `covered` tells which do not.
+
+    Raises:
+        SettingError: for shapes or types that do not fit, or an image or gaze with NaN or infinite values.
+
+    Differentiable in the image and the gaze (bilinear: piecewise smooth in the gaze).
+    """
+    scale = _checked_scale(image.shape[-2:], retina, scale)
+    require(image.dim() == 4 and image.numel() > 0, "image.shape", tuple(image.shape), "(B, C, H, W)")
+    require(image.is_floating_point(), "image.dtype", image.dtype, "a floating-point type")
+    require(bool(image.detach().sum().isfinite()), "image", "NaN or infinite values", "finite values")
+    height, width = image.shape[-2:]
+    plan = _sampling(retina, height, width, scale, image.device, image.dtype)
+    if gaze_px is None:
+        grid = plan.middle
+    else:
+        _check_gaze(gaze_px)
+        fits = len(image) in (1, len(gaze_px))
+        require(fits, "gaze_px.shape", tuple(gaze_px.shape), f"({len(image)}, 2), one per image")
+        grid = _place(plan, gaze_px.to(image))
+    values = _read(image, grid[:, : plan.above])
+    if plan.levels == 0:
+        return values
+    values = torch.cat([values, _read(_pyramid(image, plan.levels), grid[:, plan.above :])], -1)
+    wide = torch.lerp(values[..., plan.first : retina.count], values[..., retina.count :], plan.blend)
+    return torch.cat([values[..., : plan.first], wide], -1)
+
+
+def covered(retina: Retina, size: tuple[int, int], gaze_px: Tensor | None, scale: float | None = None) -> Tensor:
+    """Which RFs look at the image rather than beyond its border.
+
+    Args:
+        retina: the layout.
+        size: the image's height and width [px].
+        gaze_px: (B, 2) as in `fovea`; None for the image's middle (B = 1).
+        scale: image pixels per retinal pixel, as in `fovea`.
+
+    Returns:
+        bool (B, N): whether the RF's centre lies on a pixel of the image.
+    """
+    scale = _checked_scale(size, retina, scale)
+    height, width = size
+    if gaze_px is None:
+        gaze_px = torch.tensor([[(width - 1) / 2, (height - 1) / 2]])
+    _check_gaze(gaze_px)
+    dtype = gaze_px.dtype if gaze_px.is_floating_point() else torch.get_default_dtype()
+    place = gaze_px.to(dtype)[:, None] + scale * retina.centers_px(gaze_px.device, dtype)
+    return ((place >= -0.5) & (place <= place.new_tensor([width - 0.5, height - 0.5]))).all(-1)
+
+
+def interpolate(values: Tensor, retina: Retina, px: Tensor) -> Tensor:
+    """Values between the RFs, at any place of the retina.
+
+    Bilinear in (log ρ, θ), with wrap-around in θ, on a log-polar retina, and on the lattice of a uniform one. From the
+    centre of ring 0 inward a log-polar retina without a uniform fovea goes over, linearly in ρ, to the ring's mean.
+
+    Args:
+        values: (B, C, N).
+        retina: the layout.
+        px: (..., 2), places [retinal px].
+
+    Returns:
+        (B, C, ...). Places beyond the outermost RFs get the nearest one's value.
+
+    Raises:
+        SettingError: for another number of values.
+
+    Differentiable in the values, not in the places.
+    """
+    require(
+        values.dim() == 3 and values.shape[-1] == retina.count and values.is_floating_point(),
+        "values.shape",
+        (*values.shape, values.dtype),
+        f"(B, C, {retina.count}), floating point",
+    )
+    flat = px.detach().to(values).reshape(-1, 2)
+    if isinstance(retina, Uniform):
+        out = _from_lattice(values, retina, flat)
+    else:
+        out = _from_rings(values, retina, flat)
+        if retina.fovea_count:
+            inside = flat[:, 0] ** 2 + flat[:, 1] ** 2 < retina.rho_min_px**2
+            out = torch.where(inside, _from_lattice(values[..., : retina.fovea_count], retina, flat), out)
+    return out.reshape(*values.shape[:2], *px.shape[:-1])
+
+
+def reconstruct(
+    values: Tensor, retina: Retina, size_px: int | tuple[int, int], scale: float | None = None
+) -> tuple[Tensor, Tensor]:
+    """Turn the RFs' values back into an image, looked at in its middle.
+
+    Args:
+        values: (B, C, N).
+        retina: the layout.
+        size_px: side, or height and width, of the image.
+        scale: image pixels per retinal pixel; None lets the retina span the image's shorter side.
+
+    Returns:
+        The image (B, C, H, W), 0 outside the retina, and the mask (H, W) of pixels on the retina. See `interpolate`.
+
+    Raises:
+        SettingError: for another number of values or an impossible size.
+
+    Differentiable in the values.
+    """
+    height, width = (size_px, size_px) if isinstance(size_px, int) else size_px
+    scale = _checked_scale((height, width), retina, scale)
+    x = (torch.arange(width, device=values.device, dtype=values.dtype) - (width - 1) / 2) / scale
+    y = (torch.arange(height, device=values.device, dtype=values.dtype) - (height - 1) / 2) / scale
+    px = columns(*torch.broadcast_tensors(x, y[:, None]))
+    mask = retina.inside(px)
+    image = interpolate(values, retina, px)
+    return torch.where(mask, image, torch.zeros_like(image)), mask
+
+
+def _checked_scale(size: tuple[int, ...] | torch.Size, retina: Retina, scale: float | None) -> float:
+    require(len(size) == 2 and min(size) >= 1, "size", tuple(size), "a height and a width of at least 1 pixel")
+    if scale is None:
+        return min(size) / (2 * retina.radius_px)
+    require(0 < scale < math.inf, "scale", scale, "a positive number of image pixels per retinal pixel")
+    return float(scale)
+
+
+def _check_gaze(gaze_px: Tensor) -> None:
+    require(gaze_px.dim() == 2 and gaze_px.shape[-1] == 2, "gaze_px.shape", tuple(gaze_px.shape), "(B, 2)")
+    require(bool(gaze_px.detach().isfinite().all()), "gaze_px", "NaN or infinite values", "finite pixels")
+
+
+def _place(plan: Sampling, gaze_px: Tensor) -> Tensor:
+    """Places (B, P, 2) for gazes (B, 2), kept within their level's border."""
+    grid = torch.addcmul(plan.grid, gaze_px[:, None], plan.gain)
+    return torch.maximum(torch.minimum(grid, plan.high), plan.low)
+
+
+def _read(image: Tensor, grid: Tensor) -> Tensor:
+    """(B, C, P) of an image (B or 1, C, H, W) at places (B or 1, P, 2)."""
+    if len(image) == 1:  # many gazes at one image are rows of one grid
+        return F.grid_sample(image, grid[None], padding_mode="border", align_corners=True)[0].transpose(0, 1)
+    grid = grid[:, None].expand(len(image), -1, -1, -1)
+    return F.grid_sample(image, grid, padding_mode="border", align_corners=True)[:, :, 0]
+
+
+def halve(image: Tensor) -> Tensor:
+    """The next level of the pyramid, ⌈H/2⌉ × ⌈W/2⌉; replicated beyond the border."""
+    return _halve_along(_halve_along(image, -2), -1) / 64
+
+
+def _halve_along(image: Tensor, dim: int) -> Tensor:
+    """Weights (1, 3, 3, 1) at every second pixel; slices are faster here than a convolution."""
+    if image.shape[dim] % 2:
+        image = torch.cat([image, image.narrow(dim, -1, 1)], dim)
+    even, odd = image.unflatten(dim, (-1, 2)).unbind(dim)
+    count = even.shape[dim]
+    out = (even + odd).mul_(3)
+    out.narrow(dim, 1, count - 1).add_(odd.narrow(dim, 0, count - 1))
+    out.narrow(dim, 0, count - 1).add_(even.narrow(dim, 1, count - 1))
+    out.narrow(dim, 0, 1).add_(even.narrow(dim, 0, 1))
+    out.narrow(dim, -1, 1).add_(odd.narrow(dim, -1, 1))
+    return out
+
+
+def _pyramid(image: Tensor, levels: int) -> Tensor:
+    """Levels 1…`levels` of the pyramid, one below the other."""
+    pyramid = [halve(image)]
+    for _ in range(levels - 1):
+        pyramid.append(halve(pyramid[-1]))
+    width = pyramid[0].shape[-1]
+    return torch.cat([F.pad(level, (0, width - level.shape[-1])) for level in pyramid], -2)
+
+
+@lru_cache(maxsize=32)
+def _sampling(
+    retina: Retina, height: int, width: int, scale: float, device: torch.device, dtype: torch.dtype
+) -> Sampling:
+    with torch.inference_mode(False), torch.no_grad():
+        centers = retina.centers_px("cpu", torch.float64)
+        level = (torch.log2(retina.width_px(centers) * scale) - 1).numpy()
+        levels = max(0, min(math.ceil(level.max()), int(math.log2(min(height, width)))))
+        # layouts list narrow RFs first (but for a few percent where a uniform fovea ends): the wide ones are one slice
+        level = np.maximum.accumulate(level.clip(0, levels))
+        first = int(np.argmax(level > 0)) if (level > 0).any() else retina.count
+        fine = np.minimum(np.floor(level), max(levels - 1, 0)).astype(int)
+        above = int(np.argmax(fine > 0)) if (fine > 0).any() else retina.count
+        sizes = [np.array([width, height])]
+        for _ in range(levels):
+            sizes.append((sizes[-1] + 1) // 2)
+        offsets = [np.zeros(2)] + [np.array([0, sum(s[1] for s in sizes[1:i])]) for i in range(1, levels + 1)]
+        extents = [sizes[0]] + [np.array([sizes[1][0], sum(s[1] for s in sizes[1:])]) for _ in range(levels)]
+        which = np.concatenate([fine, fine[first:] + 1])
+        px = scale * np.concatenate([centers.numpy(), centers.numpy()[first:]])
+        shrink = 0.5 ** which[:, None]
+        low = np.array(offsets)[which]
+        high = low + np.array(sizes)[which] - 1
+        # a pixel's side spans 2/(extent − 1) of grid_sample's coordinates; along one pixel any coordinate will do
+        unit = 2 / np.maximum(np.array(extents)[which] - 1, 1)
+        grid, gain, low, high, blend = (
+            torch.as_tensor(part).to(device, dtype)
+            for part in (
+                (px * shrink + 0.5 * shrink - 0.5 + low) * unit - 1,
+                shrink * unit,
+                low * unit - 1,
+                high * unit - 1,
+                (level - fine)[first:],
+            )
+        )
+        plan = Sampling(levels, first, above, blend, grid, gain, low, high, middle=grid)
+        gaze_px = torch.tensor([[(width - 1) / 2, (height - 1) / 2]], device=device, dtype=dtype)
+        return plan._replace(middle=_place(plan, gaze_px))
+
+
+def _from_rings(values: Tensor, retina: LogPolar, px: Tensor) -> Tensor:
+    """(B, C, N) at px (P, 2)."""
+    sectors = retina.sectors
+    image = cortical(values, retina)
+    image = torch.cat([image[..., :1, :].mean(-1, keepdim=True).expand(*image.shape[:2], 1, sectors), image], -2)
+    image = torch.cat([image[..., -1:], image, image[..., :1]], -1)
+    innermost = retina.rho_min_px * math.sqrt(retina.base)
+    x, y = px.unbind(-1)
+    rho = (x * x + y * y).sqrt()
+    ring = torch.log(rho.clamp(min=innermost) / innermost) / math.log(retina.base)
+    # row 0 is ring 0's mean, at the centre; a uniform fovea stands in its place
+    inward = torch.zeros_like(rho) if retina.fovea_count else (rho / innermost).clamp(max=1) - 1
+    row = ring + inward + 1
+    angle = torch.atan2(y, x)
+    column = torch.remainder(angle * (sectors / (2 * math.pi)), sectors) + 0.5
+    return _bilinear(image, column, row)
+
+
+def _from_lattice(values: Tensor, retina: Retina, px: Tensor) -> Tensor:
+    """(B, C, N) of a uniform retina, or of a uniform fovea, at px (P, 2)."""
+    index, axis, pitch = _dense(retina, values.device)
+    return _bilinear(values[..., index], px[:, 0] / pitch + axis[0], px[:, 1] / pitch + axis[1])
+
+
+def _bilinear(image: Tensor, column: Tensor, row: Tensor) -> Tensor:
+    """(B, C, H, W) at (P,) columns and rows; the border's value beyond it."""
+    height, width = image.shape[-2:]
+    grid = torch.stack([column * (2 / (width - 1)) - 1, row * (2 / (height - 1)) - 1], -1)
+    grid = grid[None, None].expand(len(image), -1, -1, -1)
+    return F.grid_sample(image, grid, padding_mode="border", align_corners=True)[:, :, 0]
+
+
+@lru_cache(maxsize=64)
+def _dense(retina: Retina, device: torch.device) -> tuple[Tensor, tuple[float, float], float]:
+    """The square image that holds a disc's lattice: which RF each pixel shows, the axis' column and row, the pitch.
+
+    Corners show the nearest RF of their row.
+    """
+    if isinstance(retina, Uniform):
+        pitch, (places, axis) = retina.pitch_px, retina.lattice
+    else:
+        pitch, axis = retina.fovea_pitch_px, (-0.5, -0.5)
+        fine = retina.centers_px("cpu", torch.float64)[: retina.fovea_count].numpy()
+        places = np.rint(fine / pitch + np.array(axis)).astype(int)
+    corner = places.min(0)
+    columns, rows = np.ptp(places, axis=0) + 1
+    index = np.full((rows, columns), -1)
+    index[tuple((places - corner).T[::-1])] = np.arange(len(places))
+    for row in index:
+        (filled,) = np.nonzero(row >= 0)
+        row[: filled[0]], row[filled[-1] + 1 :] = row[filled[0]], row[filled[-1]]
+    with torch.inference_mode(False):
+        return torch.as_tensor(index).to(device), (axis[0] - corner[0], axis[1] - corner[1]), pitch

@@ -1,0 +1,300 @@
+"""From correspondences to 3-D Gaussians in the ego frame: triangulation and the unscented transform through it."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchfovea.gaussian import columns
+from torchfovea.sensing.camera import Camera, Pinhole
+from torchfovea.sensing.chart import Components, bilinear_moments, in_tangent_frame
+from torchfovea.sensing.correspondence import Correspondences
+from torchfovea.sensing.head import Eyes, rig_frame
+from torchfovea.sensing.head import to_ego as turn
+from torchfovea.sensing.unscented import (
+    SigmaPoints,
+    definiteness,
+    eye_root,
+    moments,
+    root_rows,
+    sigma_components,
+    sigma_root,
+)
+from torchfovea.setting import require
+
+__all__ = ["Observations", "observe", "sigma_root", "triangulate", "triangulate_rectified"]
+
+BLOCK = 16384  # receptive fields at once on a CPU, so that intermediate results stay in its cache
+
+
+class Observations(NamedTuple):
+    """Gaussian points in a chart, one for each receptive field.
+
+    Attributes:
+        mean: (..., N, 3), chart coordinates (see `torchfovea.sensing.chart`).
+        cov: packed, (..., N, 6).
+        direction: unit directions in E, (..., N, 3); the nominal ones of the inverse-range chart.
+        support_rad: half the width that the receptive field covers, seen from the eye, (..., N).
+        valid: bool (..., N); the others are finite but mean nothing.
+    """
+
+    mean: Tensor
+    cov: Tensor
+    direction: Tensor
+    support_rad: Tensor
+    valid: Tensor
+
+
+def _turned(rotation: Tensor, vector: Components) -> Components:
+    """`torchfovea.sensing.head.to_ego` by components: R v, rotation (..., 3, 3) and v's (*any, ..., N)."""
+    row = [[rotation[..., i, j].unsqueeze(-1) for j in range(3)] for i in range(3)]
+    return tuple(torch.addcmul(torch.addcmul(r[2] * vector[2], r[0], vector[0]), r[1], vector[1]) for r in row)
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    x, y, z = a.unbind(-1)
+    u, v, w = b.unbind(-1)
+    return columns(y * w - z * v, z * u - x * w, x * v - y * u)
+
+
+def triangulate(left: Tensor, right: Tensor, t_left: Tensor, t_right: Tensor) -> tuple[Tensor, Tensor]:
+    """Midpoint of the shortest segment between two rays (Eq. 8), in cross-product form.
+
+    With c = dₗ × dᵣ and the baseline b, the rays' parameters are s = (b × dᵣ)·c/|c|² and t = (b × dₗ)·c/|c|²; forming c
+    itself keeps float32 as good as float64, where the textbook's ac − b² does not.
+
+    Args:
+        left: directions dₗ (..., 3) of any length, in one frame with all others.
+        right: directions dᵣ (..., 3).
+        t_left: the left eye's centre, broadcastable to (..., 3) [m].
+        t_right: the right eye's centre.
+
+    Returns:
+        Points (..., 3) [m] and whether they lie in front of both eyes, bool (...). Where they do not (parallel rays
+        included) the point is finite and meaningless.
+
+    Differentiable where in front; zero gradient elsewhere.
+
+    References:
+        Wang, Liu (2007), for the midpoint method.
+    """
+    baseline = t_right - t_left
+    c = _cross(left, right)
+    square = (c * c).sum(-1)
+    s, t = (_cross(baseline, right) * c).sum(-1), (_cross(baseline, left) * c).sum(-1)
+    in_front = (s > 0) & (t > 0) & (square > 0)
+    inverse = 1 / torch.where(in_front, square, torch.ones_like(square))
+    point = (t_left + t_right + (s * inverse)[..., None] * left + (t * inverse)[..., None] * right) / 2
+    return torch.where(in_front[..., None], point, torch.ones_like(point)), in_front
+
+
+def triangulate_rectified(left: Tensor, right: Tensor, baseline_m: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The point between two rays in the rig's own frame, in homogeneous form: depth from horizontal disparity alone.
+
+    With the eyes at ∓b/2 on the x axis, rays (x, y, z) and (x', y', z'):
+
+        X = b/2 (x z' + x' z, y z' + y' z, 2 z z'),   w = x z' − x' z.
+
+    It is `triangulate` where the rays meet. Where noise keeps them apart it leaves the vertical mismatch out of it
+    (which is what the likelihood of isotropic noise on a rectified pair says), and numerator and denominator keep their
+    signs through parallel rays, where the shortest segment between skew rays would jump toward the eyes.
+
+    Args:
+        left: directions (..., 3) of any length, x along the baseline from left to right, z ahead.
+        right: directions (..., 3).
+        baseline_m: broadcastable to (...).
+
+    Returns:
+        X (..., 3) and w (...), the point being X/w about the baseline's middle (w < 0 beyond infinity), and whether
+        both rays look ahead: bool (...). Where they do not, X and w are finite and meaningless.
+
+    Differentiable.
+    """
+    (x, y, z), w, least = _rectified(left.unbind(-1), right.unbind(-1))
+    half, ahead = baseline_m / 2, least > 0
+    seen = ahead[..., None]
+    point = columns(half * x, half * y, half * z)
+    return torch.where(seen, point, torch.ones_like(point)), torch.where(ahead, w, torch.ones_like(w)), ahead
+
+
+def _rectified(left: Components, right: Components) -> tuple[Components, Tensor, Tensor]:
+    """2 X/b and w of `triangulate_rectified`, and how far ahead the rays look (> 0: both do)."""
+    xl, yl, zl = left
+    xr, yr, zr = right
+    across, back = xl * zr, xr * zl
+    return (
+        (across + back, torch.addcmul(yl * zr, yr, zl), 2 * (zl * zr)),
+        across - back,
+        torch.minimum(zl, zr),
+    )
+
+
+class _Rig(NamedTuple):
+    """The rig's frame, origin and baseline (see `rig_frame`), the eyes' rotations into that frame and their cameras."""
+
+    frame: Tensor
+    origin: Tensor
+    baseline: Tensor
+    left: Tensor
+    right: Tensor
+    left_camera: Camera
+    right_camera: Camera
+
+
+def observe(
+    matches: Correspondences,
+    eyes: Eyes,
+    camera: Camera,
+    support_px: Tensor,
+    points: SigmaPoints | None = None,
+    chart: str = "inverse_range",
+    rotated: bool = True,
+    right_camera: Camera | None = None,
+) -> Observations:
+    """Correspondences as Gaussian points in E: the unscented transform through triangulation (Eq. 6-18, 22-27).
+
+    Args:
+        matches: correspondences (..., N) with their retinal standard deviations.
+        eyes: poses of the cameras in E, (...).
+        camera: both eyes' camera, or the left one's, in retinal pixels.
+        support_px: half the width of each left receptive field, (..., N) or (N,) [px].
+        points: sigma points of four dimensions; None: `SigmaPoints()`, in the Cartesian chart
+            `SigmaPoints.midpoint()`.
+        chart: `inverse_range` or `cartesian`.
+        rotated: see `sigma_root`.
+        right_camera: where the right eye has another.
+
+    Returns:
+        Observations. Valid are those whose nine sigma points all lie in front of both eyes (in inverse range: whose
+        rays look ahead, for infinity is an ordinary place there), whose standard deviations are positive and whose
+        covariance is positive definite.
+
+    Raises:
+        SettingError: for an unknown chart.
+
+    Differentiable in the correspondences, their sigmas and the poses.
+    """
+    require(chart in ("inverse_range", "cartesian"), "chart", chart, "inverse_range or cartesian")
+    points = points or (SigmaPoints.midpoint() if chart == "cartesian" else SigmaPoints())
+    batch, count = matches.valid.shape[:-1], matches.valid.shape[-1]
+    eyes = Eyes(*(part.expand(*batch, *part.shape[-k:]) for part, k in zip(eyes, (2, 1, 2, 1), strict=True)))
+    frame, origin, baseline = rig_frame(eyes)
+    cameras = camera, right_camera or camera
+    rig = _Rig(frame, origin, baseline, frame.mT @ eyes.R_left, frame.mT @ eyes.R_right, *cameras)
+    transform = partial(_transform, rig=rig, points=points, chart=chart, rotated=rotated)
+    if chart == "inverse_range" and isinstance(cameras[0], Pinhole) and isinstance(cameras[1], Pinhole):
+        transform = partial(_transform_form, form=_form(rig, cameras[0], cameras[1]), points=points, rotated=rotated)
+    size = count
+    learning = torch.is_grad_enabled() and any(t.requires_grad for t in (*matches[:4], *eyes))
+    if matches.valid.device.type == "cpu" and not learning:
+        size = -(-count // max(1, round(matches.valid.numel() / BLOCK)))
+    parts = []
+    for start in range(0, max(count, 1), max(size, 1)):
+        axes = zip(matches, (-2, -2, -1, -1, -1), strict=True)
+        part = Correspondences(*(t.narrow(axis, start, min(size, count - start)) for t, axis in axes))
+        parts.append(_settled(part, *transform(part)))
+    value, direction, valid = (p[0] if len(p) == 1 else torch.cat(p, -1) for p in zip(*parts, strict=True))
+    x, y, z = camera.ray_components(*matches.left_px.unbind(-1))
+    support = support_px / camera.focal_px * torch.addcmul(torch.addcmul(z * z, x, x), y, y).rsqrt()
+    mean, cov = value[:3].movedim(0, -1), value[3:].movedim(0, -1)
+    return Observations(mean, cov, direction.movedim(0, -1), support.expand(valid.shape), valid)
+
+
+# of the images of the sigma points: mean and covariance by components, the direction of the central one (3, ..., N),
+# and a number that is positive where all of them are in front
+_Moments = tuple[list[Tensor], list[Tensor], Tensor, Tensor]
+
+
+def _transform(matches: Correspondences, rig: _Rig, points: SigmaPoints, chart: str, rotated: bool) -> _Moments:
+    """The transform point by point (Eq. 10-18), for any camera and chart."""
+    root = root_rows(matches.left_sigma_px, matches.right_sigma_px, rotated)
+    places = sigma_components((*matches.left_px.unbind(-1), *matches.right_px.unbind(-1)), root, points)
+    left = _turned(rig.left, rig.left_camera.ray_components(*places[:2]))
+    right = _turned(rig.right, rig.right_camera.ray_components(*places[2:]))
+    if chart == "cartesian":
+        zero = torch.zeros_like(rig.baseline)
+        half = torch.stack([rig.baseline / 2, zero, zero], -1).unsqueeze(-2)
+        point, both = triangulate(columns(*left), columns(*right), -half, half)
+        point = turn(rig.frame, point) + rig.origin.unsqueeze(-2)
+        direction = point[0] * (point[0] * point[0]).sum(-1, keepdim=True).rsqrt()
+        return *moments(point.unbind(-1), points), direction.movedim(-1, 0), both.all(0).to(direction.dtype)
+    x, w, least = _rectified(left, right)
+    x = _placed(rig, x, w := w * (2 / rig.baseline.unsqueeze(-1)))
+    direction = torch.stack([c[0] for c in x])
+    direction = direction * (direction * direction).sum(0).rsqrt()
+    a, b, ahead = in_tangent_frame(direction.unbind(0), x)
+    rho = w * torch.addcmul(torch.addcmul(x[0] * x[0], x[1], x[1]), x[2], x[2]).rsqrt()
+    return *moments((a / ahead, b / ahead, rho), points), direction, least.amin(0)
+
+
+def _placed(rig: _Rig, x: Components, w: Tensor) -> Components:
+    """Homogeneous points from the rig's frame to E: R X + w t."""
+    origin = rig.origin.unsqueeze(-1).unbind(-2)
+    return tuple(torch.addcmul(c, w, o) for c, o in zip(_turned(rig.frame, x), origin, strict=True))
+
+
+class _Form(NamedTuple):
+    """Triangulation with pinhole eyes, whose rays are linear in (u, v, 1): a bilinear form of the two places.
+
+    Attributes:
+        point: coefficients, the homogeneous points (X, w) in E between the rays of the places' axes, (4, 3, 3, ..., 1).
+        left: coefficients of the left ray's depth in the rig's frame, (3, ..., 1).
+        right: of the right one's.
+    """
+
+    point: Tensor
+    left: Tensor
+    right: Tensor
+
+
+def _form(rig: _Rig, left_camera: Pinhole, right_camera: Pinhole) -> _Form:
+    left, right = left_camera.turned(rig.left), right_camera.turned(rig.right)
+    x, w, _ = _rectified(left.unsqueeze(-1).unbind(-3), right.unsqueeze(-2).unbind(-3))
+    w = (w * (2 / rig.baseline[..., None, None])).flatten(-2)
+    point = torch.stack([*_placed(rig, tuple(c.flatten(-2) for c in x), w), w])
+    point = point.unflatten(-1, (3, 3)).movedim((-2, -1), (1, 2)).unsqueeze(-1)
+    return _Form(point, *(ray[..., 2, :].movedim(-1, 0).unsqueeze(-1) for ray in (left, right)))
+
+
+def _affine(coefficients: Tensor | Components, u: Tensor, v: Tensor) -> Tensor:
+    return (coefficients[0] * u).addcmul_(coefficients[1], v).add_(coefficients[2])
+
+
+def _transform_form(matches: Correspondences, form: _Form, points: SigmaPoints, rotated: bool) -> _Moments:
+    """The same for pinhole eyes in inverse range, without forming the sigma points: see `bilinear_moments`.
+
+    The form is linear in either place, so that the place's axes u and v move the point by multiples of the form there.
+    """
+    (u, v), (there_u, there_v) = matches.left_px.unbind(-1), matches.right_px.unbind(-1)
+    by_left = _affine(form.point.unbind(2), there_u, there_v)
+    by_right = _affine(form.point[:, :, :2].unbind(1), u, v)
+    by_both = torch.stack([form.point[:, 0, 0], form.point[:, 1, 1]], 1)
+    centre = torch.addcmul(by_left[:, 2], by_left[:, 0], u).addcmul_(by_left[:, 1], v)
+    root = eye_root(matches.left_sigma_px, matches.right_sigma_px, rotated)
+    # the depth of the ray nearest to the side: no column moves it by more than the larger of its two parts
+    depths = [
+        _affine(z, *place).sub_(z[:2].abs().amax(0) * eye.abs().amax(0), alpha=points.spread)
+        for z, place, eye in ((form.left, (u, v), root[0]), (form.right, (there_u, there_v), root[1]))
+    ]
+    return *bilinear_moments(centre, by_left[:, :2], by_right, by_both, *root, points), torch.minimum(*depths)
+
+
+def _settled(
+    matches: Correspondences, first: list[Tensor], second: list[Tensor], direction: Tensor, ahead: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean and covariance (9, ..., N), of unit size where not valid; the direction; and what is valid.
+
+    One number is positive where all conditions hold, and not a number where anything is not finite: comparing once is
+    faster than joining bools.
+    """
+    with torch.no_grad():
+        sure = torch.minimum(matches.left_sigma_px, matches.right_sigma_px)
+        keep = torch.minimum(torch.minimum(ahead, sure), definiteness(second))
+        keep = (keep > 0) & matches.valid
+        gone = 1 - keep.to(ahead.dtype)
+    value = torch.stack([*first, *second])
+    unit = value.new_tensor([1.0, 1, 1, 1, 0, 0, 1, 0, 1]).reshape(-1, *[1] * gone.dim())
+    return torch.addcmul((value * (1 - gone)).nan_to_num(0.0, 0.0, 0.0), unit, gone), direction, keep

@@ -1,0 +1,1 @@
+"""Matching the two eyes' pictures."""

@@ -1,0 +1,242 @@
+"""Costs of inverse-range hypotheses on a sheet of one eye, read from the other eye's image.
+
+Everything here is differentiable in the images, but for `spread`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from torchfovea.gaussian import columns
+from torchfovea.sensing.camera import Camera, Pinhole
+from torchfovea.sensing.retina import Retina, halve
+from torchfovea.stereo.sheets import Sheet, average
+
+__all__ = ["Eye", "Looks", "acuity", "correlate", "own_values", "project", "sheet_rays", "spread"]
+
+
+class Eye(NamedTuple):
+    """One eye that looks for its RFs' likes in the other; B pairs of images.
+
+    Attributes:
+        camera: its own, in retinal pixels.
+        other: the other eye's.
+        R: (B, 3, 3), from its frame to the other's.
+        t: (B, 3), its centre in the other's frame [m].
+        ahead: (B, 3), the rectified frame's z axis in its own frame.
+        images: (B, L, H, W), its image at the L levels of its pyramid; see `acuity`.
+        others: of the other eye's.
+        retina: of both.
+        scale: image pixels per retinal pixel.
+        middle: image pixel of the optical axis, column and row.
+    """
+
+    camera: Camera
+    other: Camera
+    R: Tensor
+    t: Tensor
+    ahead: Tensor
+    images: Tensor
+    others: Tensor
+    retina: Retina
+    scale: float
+    middle: tuple[float, float]
+
+
+class Looks(NamedTuple):
+    """What a sheet's cells see in their own eye.
+
+    Attributes:
+        values: (B, 1, R, S), about 0.
+        mean: of their neighbourhoods.
+        variance: of their neighbourhoods.
+    """
+
+    values: Tensor
+    mean: Tensor
+    variance: Tensor
+
+
+# planes beyond this depth per range (60 degrees from the axis) are spheres: a wide view's rim sees walls face on
+PLANE = 0.5
+
+
+def acuity(images: Tensor, retina: Retina, scale: float, middle: tuple[float, float]) -> Tensor:
+    """Images as RFs of several widths would see them.
+
+    Level k shows averages over 2ᵏ⁺¹ pixels, or over the width of the retina's RFs there, where that is larger.
+
+    Args:
+        images: (B, 1, H, W).
+        retina: their retina.
+        scale: image pixels per retinal pixel.
+        middle: image pixel of the optical axis.
+
+    Returns:
+        (B, L, H, W), about 0, up to the level of the widest RF. Differentiable.
+    """
+    height, width = images.shape[-2:]
+    x, y = (
+        (torch.arange(n, device=images.device, dtype=images.dtype) - m) / scale
+        for n, m in ((width, middle[0]), (height, middle[1]))
+    )
+    place = columns(x, y[:, None])
+    own = _level(retina.width_px(place), scale)
+    rim = retina.width_px(place.new_tensor([retina.radius_px, 0.0]))
+    top = min(math.ceil(float(_level(rim, scale)) - 1e-3), int(math.log2(min(height, width))))
+    pyramid = [images]
+    for _ in range(top):
+        pyramid.append(halve(pyramid[-1]))
+    full = [images]
+    for k in range(1, top + 1):
+        rows, across = pyramid[k].shape[-2:]
+        pixels = (torch.arange(n, device=images.device, dtype=images.dtype) for n in (width, height))
+        u, v = ((p + 0.5) * 0.5**k - 0.5 for p in pixels)
+        grid = columns(u * (2 / max(across - 1, 1)) - 1, v[:, None] * (2 / max(rows - 1, 1)) - 1)
+        grid = grid[None].expand(len(images), -1, -1, -1)
+        full.append(F.grid_sample(pyramid[k], grid, padding_mode="border", align_corners=True))
+    levels = []
+    for k in range(top + 1):
+        level = own.clamp(k, top)
+        levels.append(torch.stack([full[j] * (1 - (level - j).abs()).clamp(min=0) for j in range(k, top + 1)]).sum(0))
+    # about 0, sums of squares lose least in float32
+    return torch.cat(levels, 1) - 0.5
+
+
+def _level(width_px: Tensor, scale: float) -> Tensor:
+    """The pyramid's level that shows averages of a width; see `torchfovea.sensing.retina`."""
+    return (torch.log2(width_px * scale) - 1).clamp(min=0)
+
+
+def sheet_rays(eye: Eye, px: Tensor) -> Tensor:
+    """Rays of places (*cells, 2) in the other eye's frame, (B, *cells, 3), as long as their depth is 1.
+
+    Depth is along the rectified frame's z axis, so that one inverse depth is one plane; beyond 60 degrees from that
+    axis it is half the range.
+    """
+    x, y, z = eye.camera.rays(px).unbind(-1)
+    over = (...,) + (None,) * x.dim()
+    ahead = [a[over] for a in eye.ahead.unbind(-1)]
+    depth = ahead[0] * x + ahead[1] * y + ahead[2] * z
+    inverse = 1 / torch.maximum(depth, PLANE * (x * x + y * y + z * z).sqrt())
+    x, y, z = x * inverse, y * inverse, z * inverse
+    return columns(*(eye.R[:, i, 0][over] * x + eye.R[:, i, 1][over] * y + eye.R[:, i, 2][over] * z for i in range(3)))
+
+
+def project(eye: Eye, ray: Tensor, rho: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Where the other eye sees points on rays.
+
+    Args:
+        eye: whose rays they are.
+        ray: (B, *cells, 3) from `sheet_rays`.
+        rho: inverse depths [1/m] that broadcast to (B, D, *cells).
+
+    Returns:
+        Columns and rows (B, D, *cells) [retinal px], and bool, whether the other eye's retina does see them.
+    """
+    shift = eye.t[(..., *(None,) * (ray.dim() - 1))]
+    x, y, z = (r[:, None] + rho * shift[:, i] for i, r in enumerate(ray.unbind(-1)))
+    if isinstance(eye.other, Pinhole):  # spares half of the work
+        ahead = z > 1e-3
+        inverse = eye.other.focal_px / z.clamp(min=1e-3)
+        u, v = x * inverse + eye.other.cx_px, y * inverse + eye.other.cy_px
+    else:
+        direction = columns(x, y, z)
+        u, v = eye.other.project(direction).unbind(-1)
+        ahead = eye.other.in_view(direction)
+    return u, v, ahead & (u.detach().square() + v.detach().square() <= eye.retina.radius_px**2)
+
+
+def _read(eye: Eye, images: Tensor, u: Tensor, v: Tensor, width_px: Tensor) -> Tensor:
+    """Averages as wide as RFs of `width_px` (R, S), or wider where the retina is coarser, at places (B, D, R, S)."""
+    height, width = images.shape[-2:]
+    level = _level(width_px, eye.scale).clamp(max=images.shape[1] - 1)
+    low, high = int(level.min()), math.ceil(float(level.max()))
+    across, down = 2 / max(width - 1, 1), 2 / max(height - 1, 1)
+    grid = torch.stack(
+        [u * (eye.scale * across) + (eye.middle[0] * across - 1), v * (eye.scale * down) + (eye.middle[1] * down - 1)],
+        -1,
+    )
+    value = F.grid_sample(
+        images[:, low : high + 1], grid.flatten(2, 3), padding_mode="border", align_corners=True
+    ).unflatten(-1, u.shape[-2:])
+    out = value[:, 0]
+    if high > low:
+        out = out * (1 - (level - low)).clamp(min=0)
+        for k in range(low + 1, high + 1):
+            out = out + value[:, k - low] * (1 - (level - k).abs()).clamp(min=0)
+    return out
+
+
+def own_values(eye: Eye, sheet: Sheet, radius: int, noise: float) -> Looks:
+    """What a sheet's cells see in their own eye."""
+    u, v = (c.expand(len(eye.images), 1, -1, -1) for c in sheet.px.unbind(-1))
+    values = _read(eye, eye.images, u, v, sheet.width_px)
+    return Looks(values, *_moments(values, sheet, radius, noise))
+
+
+def _moments(values: Tensor, sheet: Sheet, radius: int, noise: float) -> tuple[Tensor, Tensor]:
+    mean, square = (average(v, radius, sheet.closed) for v in (values, values * values))
+    return mean, (square - mean * mean).clamp(min=0) + noise * noise
+
+
+def correlate(
+    eye: Eye, sheet: Sheet, own: Looks, ray: Tensor, rho: Tensor, radius: int, noise: float
+) -> tuple[Tensor, Tensor]:
+    """Zero-mean normalized cross-correlation of neighbourhoods with their likes in the other eye.
+
+    Args:
+        eye: whose sheet it is.
+        sheet: R × S cells.
+        own: what they see.
+        ray: from `sheet_rays`.
+        rho: hypotheses that broadcast to (B, D, R, S) [1/m].
+        radius: half the side of a neighbourhood, in cells.
+        noise: standard deviation of the images' noise; flat neighbourhoods correlate with nothing.
+
+    Returns:
+        (B, D, R, S) and bool, whether the other eye sees the cell itself.
+    """
+    u, v, seen = project(eye, ray, rho)
+    values = _read(eye, eye.others, u, v, sheet.width_px)
+    mean, variance = _moments(values, sheet, radius, noise)
+    cov = average(own.values * values, radius, sheet.closed) - own.mean * mean
+    return cov * (own.variance * variance).rsqrt(), seen
+
+
+@torch.no_grad()
+def spread(eye: Eye, sheet: Sheet, low: float, high: float, per_width: float, most: int) -> Tensor:
+    """Hypotheses of inverse depth as dense as the two retinas can tell apart.
+
+    Args:
+        eye: whose sheet it is.
+        sheet: its finest cell decides.
+        low: the second hypothesis [1/m].
+        high: the last but one, > low [1/m].
+        per_width: hypotheses per RF width of motion in the other eye.
+        most: at most so many.
+
+    Returns:
+        (D,), ascending, D ≥ 5; RFs widen away from the fixation of verged eyes, and hypotheses thin out.
+    """
+    knots = torch.linspace(low, high, 65, device=sheet.px.device, dtype=sheet.px.dtype)
+    stride = max(1, round(math.sqrt(sheet.width_px.numel() / 400)))
+    place, own = sheet.px[::stride, ::stride], sheet.width_px[::stride, ::stride]
+    u, v, seen = project(eye, sheet_rays(eye, place), knots[None, :, None, None])
+    seen &= eye.retina.inside(place)
+    width = torch.maximum(eye.retina.width_px(columns(u, v)), own)
+    motion = torch.hypot(u.diff(dim=1), v.diff(dim=1)) / torch.minimum(width[:, 1:], width[:, :-1])
+    rate = torch.where(seen[:, 1:] & seen[:, :-1], motion, torch.zeros_like(motion)).amax((0, 2, 3))
+    # where nothing is seen, hypotheses only fill the gap
+    rate = rate.clamp(min=1e-3 * float(rate.max()) + 1e-6)
+    steps = torch.cat([torch.zeros_like(rate[:1]), rate.cumsum(0)]) * per_width
+    count = min(max(2, math.ceil(float(steps[-1]))), most - 3)
+    at = torch.linspace(0, 1, count + 1, device=steps.device, dtype=steps.dtype) * steps[-1]
+    k = torch.searchsorted(steps, at, right=True).clamp(1, len(steps) - 1)
+    rho = knots[k - 1] + (at - steps[k - 1]) / (steps[k] - steps[k - 1]) * (knots[k] - knots[k - 1])
+    return torch.cat([2 * rho[:1] - rho[1:2], rho, 2 * rho[-1:] - rho[-2:-1]])

@@ -1,0 +1,204 @@
+"""Surfaces on one sheet of an eye: the best hypotheses of inverse depth, and their refinement with its variance."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchfovea.gaussian import columns
+from torchfovea.setting import require
+from torchfovea.stereo.costs import Eye, correlate, own_values, project, sheet_rays, spread
+from torchfovea.stereo.semiglobal import aggregate
+from torchfovea.stereo.sheets import Sheet, nearest_rf, read_sheet
+
+__all__ = ["Estimate", "Sweep", "Winner", "match_sheet", "refine", "win"]
+
+CHUNK = 100_000  # cells times hypotheses handled at once, so that they stay in the cache
+INDEPENDENT = (9.0, (81 / 19) ** 2, (729 / 141) ** 2)  # (Σw)²/Σw² of the neighbourhoods' weights
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Parameters of the sweep.
+
+    Attributes:
+        window: half the side of the neighbourhoods that choose the winner, in RFs.
+        refine_window: half the side of those that refine it.
+        per_width: hypotheses per RF width of motion on the right retina.
+        hypotheses: at most so many; beyond, they lie further apart.
+        smooth_small: penalty of a step to the next hypothesis between neighbours, as a correlation.
+        smooth_large: penalty of a larger step.
+        contrast: difference between neighbours' values at which the large penalty is halved.
+        noise: standard deviation of the images' noise, of a range of 1.
+        uniqueness: by how much the second-best surface's cost must exceed the best's, as a share of it.
+        correlation: least correlation of a match.
+        left_right_widths: RFs that claim one place of the right eye must agree to within so many RF widths with the
+            best of them; infinite: unchecked.
+        winner_widths: standard deviation of the winner before its refinement, in RF widths; what is known of a match
+            where the curve of costs is flat.
+        temperature: scales the variance that the curve of costs gives.
+        volume_sigmas: half the depth of a volume of interest, in standard deviations.
+    """
+
+    window: int = 1
+    refine_window: int = 2
+    per_width: float = 1.5
+    hypotheses: int = 256
+    smooth_small: float = 0.2
+    smooth_large: float = 2.5
+    contrast: float = 0.2
+    noise: float = 0.004
+    uniqueness: float = 0.05
+    correlation: float = 0.5
+    left_right_widths: float = 1.0
+    winner_widths: float = 0.2
+    temperature: float = 1.0
+    volume_sigmas: float = 3.0
+
+    def __post_init__(self) -> None:
+        """Raise SettingError for what the sweep cannot run with."""
+        for name in ("window", "refine_window"):
+            # a sheet keeps four cells of context
+            value = getattr(self, name)
+            require(value in (1, 2, 3), f"matcher.{name}", value, "1, 2 or 3 receptive fields")
+        require(0.1 <= self.per_width <= 10, "matcher.per_width", self.per_width, "0.1 to 10")
+        whole = isinstance(self.hypotheses, int) and self.hypotheses >= 8
+        require(whole, "matcher.hypotheses", self.hypotheses, "a whole number, at least 8")
+        large = self.smooth_small <= self.smooth_large < math.inf
+        require(0 <= self.smooth_small < math.inf, "matcher.smooth_small", self.smooth_small, "0 or more")
+        require(large, "matcher.smooth_large", self.smooth_large, f"at least smooth_small = {self.smooth_small}")
+        require(-1 <= self.correlation < 1, "matcher.correlation", self.correlation, "-1 to less than 1")
+        require(0 <= self.uniqueness < math.inf, "matcher.uniqueness", self.uniqueness, "0 or more")
+        for name in ("contrast", "noise", "left_right_widths", "winner_widths", "temperature", "volume_sigmas"):
+            require(getattr(self, name) > 0, f"matcher.{name}", getattr(self, name), "more than 0")
+
+
+class Winner(NamedTuple):
+    """The best hypotheses on a sheet, piecewise constant in the images; (B, R, S) each.
+
+    Attributes:
+        rho: inverse depth, to a quarter of a hypothesis [1/m].
+        step: distance of hypotheses there.
+        clear: whether no other surface fits nearly as well.
+    """
+
+    rho: Tensor
+    step: Tensor
+    clear: Tensor
+
+
+class Estimate(NamedTuple):
+    """Refined on a sheet; (B, R, S) each.
+
+    Attributes:
+        rho: inverse depth [1/m].
+        variance: of it.
+        correlation: of the neighbourhoods.
+        unit: inverse depth that moves the match by the wider RF's width.
+        sharp: whether the refinement stays with its winner.
+    """
+
+    rho: Tensor
+    variance: Tensor
+    correlation: Tensor
+    unit: Tensor
+    sharp: Tensor
+
+
+def match_sheet(eye: Eye, sheet: Sheet, params: Sweep, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Match a sheet's RFs with the other eye.
+
+    Args:
+        eye: whose sheet it is.
+        sheet: with n RFs.
+        params: of the sweep.
+        low: (B, N), least inverse depth of every RF of the retina [1/m].
+        high: (B, N), greatest.
+
+    Returns:
+        The RFs (n,); their inverse depth, its variance, correlation and unit, (B, 4, n); and bool (B, n), whether
+        these can be believed. Differentiable in the images.
+    """
+    winner = win(eye, sheet, params, low, high)
+    estimate = refine(eye, sheet, winner, params)
+    good = winner.clear & estimate.sharp & (estimate.correlation.detach() >= params.correlation)
+    values = torch.stack([estimate.rho, estimate.variance, estimate.correlation, estimate.unit], 1)
+    return (sheet.rf, *read_sheet(sheet, values, winner.rho, good, 1.5 * winner.step))
+
+
+@torch.no_grad()
+def win(eye: Eye, sheet: Sheet, params: Sweep, low: Tensor, high: Tensor) -> Winner:
+    """The best hypotheses between bounds, see `match_sheet`."""
+    cell = nearest_rf(eye.retina, 1 / eye.scale, sheet.px)
+    low, high = low[:, cell][:, None], high[:, cell][:, None]
+    least, most = float(low.amin()), float(high.amax())
+    rho = spread(eye, sheet, least, max(most, least + 1e-6), params.per_width, params.hypotheses)[None, :, None, None]
+    own, ray = own_values(eye, sheet, params.window, params.noise), sheet_rays(eye, sheet.px)
+    cost = ray.new_empty(len(ray), rho.numel(), *sheet.width_px.shape)
+    chunk = max(1, CHUNK // low.numel())
+    bounded = bool((low > least).any() or (high < most).any())
+    for k in range(0, rho.numel(), chunk):
+        some = rho[:, k : k + chunk]
+        z, seen = correlate(eye, sheet, own, ray, some, params.window, params.noise)
+        if bounded:
+            slack = (some - rho[:, max(k - 1, 0) : max(k - 1, 0) + some.shape[1]]).abs().amax()
+            seen = seen & (some >= low - slack) & (some <= high + slack)
+        cost[:, k : k + chunk] = torch.where(seen, 1 - z, torch.ones_like(z)).clamp_(max=1)
+    rho = rho.flatten()
+    total = aggregate(cost, own.values[:, 0], sheet.closed, params.smooth_small, params.smooth_large, params.contrast)
+    best = total.amin(0)
+    index = torch.arange(len(rho), device=rho.device, dtype=torch.int16)[:, None, None, None]
+    win = torch.where(total == best, index, len(rho)).amin(0).long()
+    inner = win.clamp(1, len(rho) - 2)
+    before, here, after = (total.gather(0, (inner + k)[None])[0] for k in (-1, 0, 1))
+    for k in range(-2, 3):  # what is left are other surfaces
+        total.scatter_(0, (win + k).clamp(0, len(rho) - 1)[None], math.inf)
+    clear = total.amin(0) - best >= params.uniqueness * best
+    win = inner
+    bend = before - 2 * here + after
+    part = torch.where(bend > 0, (before - after) / (2 * bend.clamp(min=1e-9)), torch.zeros_like(bend))
+    part = (4 * part.clamp(-0.5, 0.5)).round() / 4
+    step = torch.where(part < 0, rho[win] - rho[win - 1], rho[win + 1] - rho[win])
+    return Winner(rho[win] + part * step, step, clear)
+
+
+def refine(eye: Eye, sheet: Sheet, winner: Winner, params: Sweep) -> Estimate:
+    """The minimum of the curve of costs about the winners, on neighbourhoods that follow their surface."""
+    with torch.no_grad():
+        ray, surface = sheet_rays(eye, sheet.px), _smooth(winner)
+        u, v, _ = project(eye, ray, torch.stack([surface, surface + winner.step], 1))
+        width = torch.maximum(eye.retina.width_px(columns(u[:, 0], v[:, 0])), sheet.width_px)
+        motion = torch.hypot(u[:, 1] - u[:, 0], v[:, 1] - v[:, 0])
+        unit = winner.step * (width / motion.clamp(min=1e-6)).clamp(max=10)
+    own = own_values(eye, sheet, params.refine_window, params.noise)
+    offset = torch.linspace(-1, 1, 5, device=unit.device, dtype=unit.dtype)[:, None, None]
+    tried = surface[:, None] + offset * unit[:, None]
+    cost = 1 - correlate(eye, sheet, own, ray, tried, params.refine_window, params.noise)[0]
+    # the least-squares parabola
+    square = offset.square() - offset.square().mean()
+    slope = (offset * cost).sum(1) / offset.square().sum()
+    bend = 2 * (square * cost).sum(1) / square.square().sum()
+    least = (cost.mean(1) - offset.square().mean() * bend / 2).clamp(min=1e-3)
+    # samples of a neighbourhood by its weights; RFs overlap, which makes about half of them independent
+    independent = INDEPENDENT[params.refine_window - 1] / 2
+    evidence = independent / (2 * params.temperature * least)
+    # the winner itself is known to about `winner_widths`, where the curve says nothing
+    precision = evidence * bend.clamp(min=0) + params.winner_widths**-2
+    best = -evidence * slope / precision
+    sharp = best.detach().abs() < 1
+    return Estimate(surface + best.clamp(-1, 1) * unit, unit * unit / precision, 1 - least, unit, sharp)
+
+
+def _smooth(winner: Winner) -> Tensor:
+    """Winners averaged with their eight neighbours on the same surface."""
+    total, weight = torch.zeros_like(winner.rho), torch.zeros_like(winner.rho)
+    for i in (-1, 0, 1):
+        for j in (-1, 0, 1):
+            other = winner.rho.roll((i, j), (-2, -1))
+            near = ((other - winner.rho).abs() <= 1.5 * winner.step).to(other.dtype)
+            total, weight = total + near * other, weight + near
+    return total / weight

@@ -1,0 +1,1 @@
+"""Judging sensors and their uncertainty (Sec. 7.1)."""
