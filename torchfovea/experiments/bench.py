@@ -21,10 +21,10 @@ from torchfovea.bench.retina_paths import path_of_retina
 from torchfovea.bench.steps import batched_steps, paths_of_steps
 from torchfovea.bench.timing import Path, Peer, Timing, copy_bandwidth, interleaved, same, slope
 from torchfovea.config import run_folder
-from torchfovea.experiments.build import build_cells, build_observer, build_scene_of, choice, number, whole
+from torchfovea.experiments.build import build_arena, build_cells, build_observer, build_scene_of, choice, number, whole
 from torchfovea.experiments.rollout import roll_out
 from torchfovea.files import write_csv, write_result
-from torchfovea.perception import Observer
+from torchfovea.perception import Observer, Step, decide, new_mind, perceive
 from torchfovea.sensing.camera import image_camera
 from torchfovea.sensing.head import Gaze, eyes
 from torchfovea.sensing.layout import LogPolar
@@ -35,7 +35,7 @@ from torchfovea.tuning.simulator import Task, World, simulate, world_of
 
 __all__ = ["run"]
 
-PATHS = ("retina", "triangulate_ut", "align", "fuse", "decide", "step", "render", "episode", "tune")
+PATHS = ("retina", "triangulate_ut", "align", "fuse", "decide", "step", "render", "saccade", "episode", "tune")
 SECONDS = {"quick": 0.3, "full": 3.0, "paper": 10.0}
 _COLUMNS = (
     "path", "work", "device", "peer", "median_ms", "low_ms", "high_ms", "runs",
@@ -194,6 +194,7 @@ def _builders(cfg: DictConfig, device: str, wanted: tuple[str, ...]) -> list[Cal
     if device == "cpu":
         builders += [
             (("render",), lambda: [_render(cfg, full, source)]),
+            (("saccade",), lambda: [_saccade(cfg, full)]),
             (("tune",), lambda: [_tune(cfg, full)]),
         ]
     return [build for names, build in builders if set(names) & set(wanted)]
@@ -231,6 +232,27 @@ def _render(cfg: DictConfig, observer: Observer, size: int) -> Path:
         check,
         sum(part.numel() * part.element_size() for part in picture),
     )
+
+
+def _saccade(cfg: DictConfig, observer: Observer) -> Path:
+    """All of a photometric saccade: both eyes' pictures by rays, matching, triangulation, memory, decision."""
+    settings = OmegaConf.merge(cfg, {"fidelity": "photometric", "sensor": {"sample": None}})
+    assert isinstance(settings, DictConfig)
+    arena, generator = build_arena(settings, observer, int(cfg.seed)), torch.Generator().manual_seed(int(cfg.seed))
+    mind = new_mind(observer, build_cells(cfg, observer.head, generator))
+    zero = torch.zeros(())
+    gaze = Gaze(zero, zero + 0.3, zero + 0.1)
+
+    def saccade() -> Step:
+        look = arena.look(gaze, generator)
+        return decide(observer, perceive(observer, mind, look.matches, eyes(observer.head, gaze)), generator)
+
+    def check() -> None:
+        if int(saccade().cell) < 0:
+            raise RuntimeError("saccade: nothing to fixate")
+
+    work = f"two pictures of {arena.world.source_px} px by rays, {cfg.matcher.name}, to the next fixation"
+    return Path("saccade", work, "cpu", saccade, (), check)
 
 
 def _episode(cfg: DictConfig, observer: Observer, batch: int, device: str) -> Path:
