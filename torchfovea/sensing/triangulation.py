@@ -27,7 +27,7 @@ from torchfovea.setting import require
 
 __all__ = ["Observations", "observe", "sigma_root", "triangulate", "triangulate_rectified"]
 
-BLOCK = 16384  # receptive fields at once on a CPU, so that intermediate results stay in its cache
+BLOCK = 16384  # receptive fields at once, a thread: intermediate results stay in its cache
 
 
 class Observations(NamedTuple):
@@ -190,7 +190,7 @@ def observe(
     size = count
     learning = torch.is_grad_enabled() and any(t.requires_grad for t in (*matches[:4], *eyes))
     if matches.valid.device.type == "cpu" and not learning:
-        size = -(-count // max(1, round(matches.valid.numel() / BLOCK)))
+        size = -(-count // max(1, round(matches.valid.numel() / (BLOCK * torch.get_num_threads()))))
     parts = []
     for start in range(0, max(count, 1), max(size, 1)):
         axes = zip(matches, (-2, -2, -1, -1, -1), strict=True)
