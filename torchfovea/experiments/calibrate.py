@@ -12,12 +12,12 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 from torch import Tensor
 
 from torchfovea.config import run_folder
 from torchfovea.experiments.build import build_matcher, build_scene_of, build_sensor, choice, construct, whole
+from torchfovea.experiments.progress import progress_bar
 from torchfovea.experiments.truths import Truths, look_at_pair, look_at_world
 from torchfovea.files import replacing, write_csv, write_result
 from torchfovea.sensing.correspondence import Budget
@@ -124,9 +124,7 @@ def _simulate(
     renderer = cast(Literal["rays", "gl"], choice(cfg, "renderer.name", ("rays", "gl")))
     seeds = [seed + k for k in range(scenes)], [seed + JUDGED_SEEDS + k for k in range(judged_scenes)]
     parts: tuple[list[Truths], list[Truths]] = ([], [])
-    bars = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-    console = Console(stderr=True)
-    with Progress(*bars, TimeRemainingColumn(), console=console, transient=True, disable=not console.is_terminal) as p:
+    with progress_bar() as p:
         task = p.add_task("looks", total=(scenes + judged_scenes) * looks)
         for part, those in zip(parts, seeds, strict=True):
             for k in those:

@@ -11,7 +11,6 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 from torch import Tensor
 
@@ -19,6 +18,7 @@ from torchfovea.config import run_folder
 from torchfovea.experiments.build import build_sensor, construct, number, whole
 from torchfovea.experiments.honesty import CHUNK, plan_cases, plan_planes, propagate, realise, wholes
 from torchfovea.experiments.manifest import finished
+from torchfovea.experiments.progress import progress_bar
 from torchfovea.files import write_csv, write_result
 from torchfovea.sensing.correspondence import Budget
 from torchfovea.sensing.layout import LogPolar, Uniform
@@ -61,15 +61,8 @@ def run(cfg: DictConfig) -> float:
     done_before = finished(cfg, folder, "foveal_advantage_min_nats")
     if done_before is not None:
         return done_before
-    bars = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
     figures: dict[str, Any] = {f"{name}_receptive_fields": printed[name].retina.count for name in SENSORS}
-    with Progress(*bars, console=Console(stderr=True), transient=True) as progress:
+    with progress_bar() as progress:
         task = progress.add_task("planes", total=4 * len(distance) * len(vergence))
 
         def done() -> None:

@@ -12,7 +12,6 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from torchfovea.config import run_folder
@@ -21,6 +20,7 @@ from torchfovea.experiments.cells import METRICS, Task, cells_of, run_task, task
 from torchfovea.experiments.claims import Claim, Verdict, judge, read_claims, select
 from torchfovea.experiments.fig5 import judge_fig5
 from torchfovea.experiments.manifest import finished
+from torchfovea.experiments.progress import progress_bar
 from torchfovea.experiments.report import write_report
 from torchfovea.experiments.workers import worker_pool
 from torchfovea.files import write_csv, write_json, write_result
@@ -102,16 +102,14 @@ def _episodes(tasks: list[Task], folder: Path, workers: int) -> list[Row]:
         else:
             missing.append(task)
     failed = []
-    bars = (TextColumn("reproduce"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    console = Console(stderr=True)
-    with Progress(*bars, console=console, transient=True, disable=not console.is_terminal) as progress:
+    with progress_bar() as progress:
         bar = progress.add_task("reproduce", total=len(missing))
         for task, outcome in _outcomes(missing, workers):
             name = task_name(task)
             if isinstance(outcome, Exception):
                 line = describe(outcome, task.overrides) or f"{type(outcome).__name__}: {outcome}"
                 failed.append(name)
-                console.print(f"reproduce: {name}: {line}", highlight=False, markup=False, soft_wrap=True)
+                progress.console.print(f"reproduce: {name}: {line}", highlight=False, markup=False, soft_wrap=True)
             else:
                 write_json(folder / f"{name}.json", outcome)
                 rows += outcome

@@ -9,7 +9,6 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from torchfovea.arena import Look
@@ -17,6 +16,7 @@ from torchfovea.config import run_folder
 from torchfovea.episode import Episode
 from torchfovea.experiments.build import build_matcher, build_observer, choice, whole
 from torchfovea.experiments.manifest import finished
+from torchfovea.experiments.progress import progress_bar
 from torchfovea.experiments.rollout import batched, one_episode, roll_out
 from torchfovea.experiments.strategy import build_strategy
 from torchfovea.experiments.workers import worker_pool
@@ -46,18 +46,10 @@ def run(cfg: DictConfig) -> float:
     done = finished(cfg, folder)
     if done is not None:
         return done
-    bars = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    console = Console(stderr=True)
     rows: list[tuple[Any, ...]] = []
     steps: list[tuple[Any, ...]] = []
     last: Episode | None = None
-    with Progress(*bars, console=console, transient=True, disable=not console.is_terminal) as progress:
+    with progress_bar() as progress:
         task = progress.add_task("search", total=episodes * saccades)
 
         def advance(count: int) -> Callable[[int, Look, Step], None]:

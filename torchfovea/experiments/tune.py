@@ -11,13 +11,13 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 from torch import Tensor
 
 from torchfovea.config import run_folder
 from torchfovea.experiments.build import build_observer, construct, number, whole
 from torchfovea.experiments.manifest import finished
+from torchfovea.experiments.progress import progress_bar
 from torchfovea.experiments.tune_study import check_study, study_curves, study_gradients
 from torchfovea.files import replacing, write_csv, write_result
 from torchfovea.memory.sphere import direction_mixture, sphere_quadrature
@@ -124,14 +124,7 @@ def _run(cfg: DictConfig) -> float:
         return before
     if cfg.resume is not None and not checkpoint.exists():
         shutil.copyfile(cfg.resume, checkpoint)
-    bars = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*bars, console=Console(stderr=True), transient=True) as progress:
+    with progress_bar() as progress:
         bar = progress.add_task("tune", total=schedule.episodes)
 
         def show(state: State, value: float) -> None:

@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 import torch
 from omegaconf import DictConfig
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from torch import Tensor
 
 from torchfovea.experiments.build import whole
+from torchfovea.experiments.progress import progress_bar
 from torchfovea.files import replacing, write_csv
 from torchfovea.setting import SettingError, require
 from torchfovea.tuning.baselines import TABLE_1, table_1
@@ -47,11 +46,6 @@ _GRADIENT_COLUMNS = (
     "point", "estimator", "cosine", "cosine_without_noise", "norm_ratio", "norm_ratio_error", "norm", "norm_error",
     "snr_32_episodes",
 )  # fmt: skip
-
-
-def _bar() -> Progress:
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    return Progress(*columns, console=Console(stderr=True), transient=True)
 
 
 def _read(path: Path, columns: tuple[str, ...]) -> list[list[str]]:
@@ -86,7 +80,7 @@ def study_curves(
     whole_ones = Counter((row.method, row.seed) for row in kept)
     done = {pair for pair, count in whole_ones.items() if count == len(budgets)}
     rows = [row for row in kept if (row.method, row.seed) in done]
-    with _bar() as bar:
+    with progress_bar() as bar:
         job = bar.add_task("study", total=len(methods) * seeds, completed=len(done))
 
         def show(method: str, seed: int) -> None:
@@ -135,7 +129,7 @@ def study_gradients(
     middle = torch.tensor(state.history[len(state.history) // 2][2], dtype=torch.float64)
     target = table_1(problem.shape, "target", float(cfg.acquisition.alpha))
     checks = []
-    with _bar() as bar:
+    with progress_bar() as bar:
         job = bar.add_task("gradients", total=3 * (len(names) + 2))
 
         def made(name: str, make: Any) -> Sample:
