@@ -306,7 +306,7 @@ def test_all_pairs_find_what_the_tree_finds(dtype):
     directions = torch.stack((random_directions(300, 0), cluster(300, 1, 0.3))).to(dtype).double()
     cells = torch.stack((random_directions(200, 3), cluster(200, 4, 0.3)))
     asks, gate = torch.rand(2, 200, generator=torch.Generator().manual_seed(0)) < 0.7, torch.tensor(0.2, dtype=F64)
-    (a, far), (b, chord) = (search(directions, cells, asks, gate) for search in (_by_tree, _by_all_pairs))
+    (a, far), (b, chord) = _by_tree(directions, cells, asks, gate), _by_all_pairs(directions, cells, asks)
     near = far < math.inf
     assert bool(near.any()) and torch.equal(near, asks & (chord <= far[near].max()))
     assert torch.equal(a[near], b[near])

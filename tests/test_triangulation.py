@@ -16,8 +16,8 @@ from torchfovea.sensing.camera import Fisheye, Pinhole
 from torchfovea.sensing.chart import cartesian_from_inverse_range, inverse_range_coordinates
 from torchfovea.sensing.correspondence import Correspondences
 from torchfovea.sensing.head import Eyes, Gaze, Head, cyclopean, eyes, fixate, rig_frame, to_ego
-from torchfovea.sensing.triangulation import observe, sigma_root, triangulate, triangulate_rectified
-from torchfovea.sensing.unscented import SigmaPoints
+from torchfovea.sensing.triangulation import observe, triangulate, triangulate_rectified
+from torchfovea.sensing.unscented import SigmaPoints, sigma_root
 from torchfovea.setting import SettingError
 
 HEAD = Head()

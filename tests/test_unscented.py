@@ -8,8 +8,8 @@ from filterpy.kalman import unscented_transform as filterpy_transform
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchfovea.gaussian import columns, pack, positive_definite
-from torchfovea.sensing.unscented import SigmaPoints, definiteness, unscented_transform
+from torchfovea.gaussian import columns, definiteness, pack, positive_definite, unpack
+from torchfovea.sensing.unscented import SigmaPoints, unscented_transform
 from torchfovea.setting import SettingError
 
 CHOICES = [SigmaPoints(), SigmaPoints.paper()]
@@ -100,6 +100,12 @@ def test_definiteness_is_positive_where_positive_definite(dtype):
     for k, value in enumerate((0.0, -1.0, torch.inf, torch.nan)):
         for entry in range(6):
             cov[6 * k + entry, entry] = value
-    want = positive_definite(cov)
+    # Sylvester's criterion on the unit diagonal, by LAPACK
+    full, tolerance = unpack(cov.double()), max(8 * torch.finfo(dtype).eps, 1e-13)
+    scale = full.diagonal(dim1=1, dim2=2).rsqrt()
+    full = (full * scale[:, :, None] * scale[:, None]).nan_to_num(0.0)
+    want = (torch.linalg.det(full[:, :2, :2]) > tolerance) & (torch.linalg.det(full) > tolerance)
+    want &= torch.isfinite(cov).all(-1) & (unpack(cov).diagonal(dim1=1, dim2=2) > 0).all(-1)
     assert 100 < int(want.sum()) < 3900
     assert torch.equal(definiteness(cov.unbind(-1)) > 0, want)
+    assert torch.equal(positive_definite(cov), want)

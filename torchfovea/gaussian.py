@@ -9,6 +9,7 @@ All functions broadcast over leading axes and are differentiable in every tensor
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -18,6 +19,7 @@ __all__ = [
     "Gaussian",
     "Information",
     "columns",
+    "definiteness",
     "gaussian_from_information",
     "information_from_gaussian",
     "inverse3",
@@ -97,13 +99,19 @@ def positive_definite(sym: Tensor, tolerance: float | None = None) -> Tensor:
     Sylvester's criterion on the matrix scaled to a unit diagonal, whose minors must exceed `tolerance`: by default the
     rounding of its dtype, so that what passes can be inverted in it.
     """
+    return definiteness(sym.detach().unbind(-1), tolerance) > 0
+
+
+def definiteness(sym: Sequence[Tensor], tolerance: float | None = None) -> Tensor:
+    """The number that `positive_definite` compares, of six components (...): positive there, elsewhere not, or NaN."""
+    xx, xy, xz, yy, yz, zz = sym
     if tolerance is None:
-        tolerance = max(8 * torch.finfo(sym.dtype).eps, 1e-13)
-    xx, xy, xz, yy, yz, zz = sym.detach().unbind(-1)
+        tolerance = max(8 * torch.finfo(xx.dtype).eps, 1e-13)
     sx, sy, sz = xx.rsqrt(), yy.rsqrt(), zz.rsqrt()  # NaN, which no comparison passes, for what is not positive
     xy, xz, yz = xy * sx * sy, xz * sx * sz, yz * sy * sz
-    det = 1 - yz * yz - xy * (xy - xz * yz) - xz * (xz - xy * yz)
-    return (torch.minimum(1 - xy * xy, det) > tolerance) & (xx + yy + zz < torch.inf)
+    minor, other, rest = 1 - xy * xy, 1 - xz * xz, yz - xy * xz
+    least = torch.minimum(minor, minor * other - rest * rest) - tolerance
+    return torch.add(least, xx + yy + zz, alpha=0)  # NaN where a diagonal is infinite
 
 
 def times3(sym: Tensor, vector: Tensor) -> Tensor:

@@ -64,7 +64,7 @@ class Observer:
         retina: both eyes' retina.
         budget: where a correspondence's standard deviation comes from.
         points: sigma points of the unscented transform; None: those that suit the chart.
-        rotated: see `torchfovea.sensing.triangulation.sigma_root`.
+        rotated: see `torchfovea.sensing.unscented.sigma_root`.
         fusion: how observations enter the memory.
         prior: of a cell not yet seen.
         reward: `inverse_range` or `range`: near is good, in either measure (Eq. 36).

@@ -172,8 +172,8 @@ def nearest_observation(
         length = (x * x + y * y + z * z).sqrt()
         # those that do not count lie farther off than any that do
         o = torch.stack([torch.where(seen, t / length, 9.0) for t in (x, y, z)], -1)
-        search = _by_tree if o.device.type == "cpu" else _by_all_pairs
-        found = search(o.view(-1, count, 3), cells.detach().reshape(-1, *cells.shape[-2:]), asks, gate)
+        sets_of = o.view(-1, count, 3), cells.detach().reshape(-1, *cells.shape[-2:]), asks
+        found = _by_tree(*sets_of, gate) if o.device.type == "cpu" else _by_all_pairs(*sets_of)
         number, chord = (part.view(shape) for part in found)
     within = asks & (chord <= _chord(gate))
     cosine = torch.where(within, 1 - 0.5 * chord * chord, -1.0).to(cells.dtype)
@@ -198,8 +198,8 @@ def _by_tree(o: Tensor, c: Tensor, asks: Tensor, gate: Tensor) -> tuple[Tensor, 
     return number, chord
 
 
-def _by_all_pairs(o: Tensor, c: Tensor, asks: Tensor, gate: Tensor) -> tuple[Tensor, Tensor]:
-    """Number of the nearest observation and its chord; `gate` is not used."""
+def _by_all_pairs(o: Tensor, c: Tensor, asks: Tensor) -> tuple[Tensor, Tensor]:
+    """Number of the nearest observation and its chord, however far."""
     asks = asks.view(c.shape[:-1])
     most = int(asks.sum(-1).max())
     asking = asks.to(torch.uint8).argsort(dim=-1, descending=True, stable=True)[:, :most]

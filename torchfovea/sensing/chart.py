@@ -78,21 +78,18 @@ def in_tangent_frame(direction: Components, vector: Components) -> tuple[Tensor,
     )
 
 
-def inverse_range_coordinates(
-    homogeneous: Tensor, weight: Tensor, direction: Tensor, tangents: tuple[Tensor, ...] | None = None
-) -> Tensor:
+def inverse_range_coordinates(homogeneous: Tensor, weight: Tensor, direction: Tensor) -> Tensor:
     """Coordinates (a, b, ρ) of the points homogeneous/weight.
 
     Args:
         homogeneous: (..., 3) in E, finite and in front (a point at infinity has weight 0).
         weight: (...), negative beyond infinity.
         direction: nominal unit directions, broadcastable to (..., 3).
-        tangents: e₁ and e₂ where they are known in the frame of the points; None: `basis(direction)`.
 
     Returns:
         (..., 3). Differentiable in all.
     """
-    e1, e2 = tangents or basis(direction)
+    e1, e2 = basis(direction)
     ahead = 1 / _dot(direction, homogeneous)
     return columns(
         _dot(e1, homogeneous) * ahead,

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchfovea.gaussian import columns
+from torchfovea.gaussian import columns, definiteness
 from torchfovea.sensing.camera import Camera, Pinhole
 from torchfovea.sensing.chart import Components, bilinear_moments, in_tangent_frame
 from torchfovea.sensing.correspondence import Correspondences
@@ -16,16 +16,14 @@ from torchfovea.sensing.head import Eyes, rig_frame
 from torchfovea.sensing.head import to_ego as turn
 from torchfovea.sensing.unscented import (
     SigmaPoints,
-    definiteness,
     eye_root,
     moments,
     root_rows,
     sigma_components,
-    sigma_root,
 )
 from torchfovea.setting import require
 
-__all__ = ["Observations", "observe", "sigma_root", "triangulate", "triangulate_rectified"]
+__all__ = ["Observations", "observe", "triangulate", "triangulate_rectified"]
 
 BLOCK = 16384  # receptive fields at once, a thread: intermediate results stay in its cache
 
@@ -164,7 +162,7 @@ def observe(
         points: sigma points of four dimensions; None: `SigmaPoints()`, in the Cartesian chart
             `SigmaPoints.midpoint()`.
         chart: `inverse_range` or `cartesian`.
-        rotated: see `sigma_root`.
+        rotated: see `torchfovea.sensing.unscented.sigma_root`.
         right_camera: where the right eye has another.
 
     Returns:

@@ -19,7 +19,6 @@ from torchfovea.setting import require
 
 __all__ = [
     "SigmaPoints",
-    "definiteness",
     "eye_root",
     "moments",
     "moments_of_differences",
@@ -168,16 +167,6 @@ def moments_of_differences(delta: Sequence[Tensor], points: SigmaPoints) -> tupl
         for j in range(i, len(delta))
     ]
     return shift, second
-
-
-def definiteness(cov: Sequence[Tensor]) -> Tensor:
-    """Positive where `torchfovea.gaussian.positive_definite`, by components, (...); elsewhere not, or not a number."""
-    xx, xy, xz, yy, yz, zz = cov
-    sx, sy, sz = xx.rsqrt(), yy.rsqrt(), zz.rsqrt()
-    xy, xz, yz = xy * sx * sy, xz * sx * sz, yz * sy * sz
-    minor, other, rest = 1 - xy * xy, 1 - xz * xz, yz - xy * xz
-    least = torch.minimum(minor, minor * other - rest * rest) - max(8 * torch.finfo(xx.dtype).eps, 1e-13)
-    return torch.add(least, xx + yy + zz, alpha=0)
 
 
 def sigma_root(left_sigma: Tensor, right_sigma: Tensor, rotated: bool = True) -> Tensor:

@@ -59,7 +59,7 @@ class PlaneSensor:
         baseline_m: distance between the eyes, > 0.
         budget: the retinal error budget; the paper has the retina's term only.
         points: sigma points; the paper's by default.
-        rotated: see `torchfovea.sensing.triangulation.sigma_root`; the paper's root is diagonal.
+        rotated: see `torchfovea.sensing.unscented.sigma_root`; the paper's root is diagonal.
     """
 
     camera: Camera

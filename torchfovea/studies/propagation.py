@@ -18,8 +18,8 @@ from torchfovea.sensing.camera import Camera
 from torchfovea.sensing.chart import inverse_range_coordinates
 from torchfovea.sensing.correspondence import Correspondences
 from torchfovea.sensing.head import Eyes, rig_frame, to_ego
-from torchfovea.sensing.triangulation import sigma_root, triangulate, triangulate_rectified
-from torchfovea.sensing.unscented import SigmaPoints, unscented_transform
+from torchfovea.sensing.triangulation import triangulate, triangulate_rectified
+from torchfovea.sensing.unscented import SigmaPoints, sigma_root, unscented_transform
 from torchfovea.setting import require
 from torchfovea.studies.characterization import PlaneSensor, correspond_plane, elementwise_jacobian, straight_eyes
 
