@@ -136,6 +136,8 @@ def stack(rows: Sequence[Any]) -> Any:
     first = rows[0]
     if isinstance(first, tuple):
         return type(first)(*(stack(parts) for parts in zip(*rows, strict=True)))
+    if first is None:
+        return None
     if isinstance(first, bool):
         return torch.tensor(rows)
     if isinstance(first, float | int):

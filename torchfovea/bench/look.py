@@ -57,9 +57,9 @@ def saccade(observer: Observer, cells: Tensor, device: str = "cpu", seed: int = 
 def part_of(look: Saccade, count: int) -> Saccade:
     """The same with receptive fields drawn evenly from all of them."""
     every = torch.linspace(0, look.matches.valid.shape[-1] - 1, count).long().to(look.matches.valid.device)
-    kept = [part[every] for part in look.matches]
-    kept = [columns(*part.unbind(-1)) if part.dim() == 2 else part for part in kept]
-    return look._replace(matches=Correspondences(*kept))
+    kept = look.matches.take(every)
+    left_px, right_px = (columns(*part.unbind(-1)) for part in kept[:2])
+    return look._replace(matches=kept._replace(left_px=left_px, right_px=right_px))
 
 
 def support_of(look: Saccade) -> Tensor:

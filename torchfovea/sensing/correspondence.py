@@ -25,6 +25,8 @@ class Correspondences(NamedTuple):
         left_sigma_px: (..., N), standard deviation along each axis.
         right_sigma_px: (..., N).
         valid: bool (..., N).
+        inlier: (..., N), probability that the two places show one point at all, by what the matcher knows of this pair;
+            None: certain.
     """
 
     left_px: Tensor
@@ -32,6 +34,12 @@ class Correspondences(NamedTuple):
     left_sigma_px: Tensor
     right_sigma_px: Tensor
     valid: Tensor
+    inlier: Tensor | None = None
+
+    def take(self, index: int | Tensor) -> Correspondences:
+        """Every part at an index of the first axis: some receptive fields (N,), or one row of a batch (B, N)."""
+        inlier = None if self.inlier is None else self.inlier[index]
+        return Correspondences(*(part[index] for part in self[:5]), inlier)
 
 
 class Disparity(NamedTuple):

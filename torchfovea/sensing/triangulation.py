@@ -37,6 +37,7 @@ class Observations(NamedTuple):
         direction: unit directions in E, (..., N, 3); the nominal ones of the inverse-range chart.
         support_rad: half the width that the receptive field covers, seen from the eye, (..., N).
         valid: bool (..., N); the others are finite but mean nothing.
+        inlier: (..., N), see `torchfovea.sensing.correspondence.Correspondences`; None: certain.
     """
 
     mean: Tensor
@@ -44,6 +45,7 @@ class Observations(NamedTuple):
     direction: Tensor
     support_rad: Tensor
     valid: Tensor
+    inlier: Tensor | None = None
 
 
 def _turned(rotation: Tensor, vector: Components) -> Components:
@@ -191,14 +193,15 @@ def observe(
         size = -(-count // max(1, round(matches.valid.numel() / (BLOCK * torch.get_num_threads()))))
     parts = []
     for start in range(0, max(count, 1), max(size, 1)):
-        axes = zip(matches, (-2, -2, -1, -1, -1), strict=True)
+        axes = zip(matches[:5], (-2, -2, -1, -1, -1), strict=True)
         part = Correspondences(*(t.narrow(axis, start, min(size, count - start)) for t, axis in axes))
         parts.append(_settled(part, *transform(part)))
     value, direction, valid = (p[0] if len(p) == 1 else torch.cat(p, -1) for p in zip(*parts, strict=True))
     x, y, z = camera.ray_components(*matches.left_px.unbind(-1))
     support = support_px / camera.focal_px * torch.addcmul(torch.addcmul(z * z, x, x), y, y).rsqrt()
     mean, cov = value[:3].movedim(0, -1), value[3:].movedim(0, -1)
-    return Observations(mean, cov, direction.movedim(0, -1), support.expand(valid.shape), valid)
+    inlier = valid.to(mean.dtype) if matches.inlier is None else matches.inlier
+    return Observations(mean, cov, direction.movedim(0, -1), support.expand(valid.shape), valid, inlier)
 
 
 # of the images of the sigma points: mean and covariance by components, the direction of the central one (3, ..., N),

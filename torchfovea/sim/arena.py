@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchfovea.arena import Fixation, Look, Move, Truth
 from torchfovea.perception import Observer
-from torchfovea.sensing.correspondence import Correspondences, Disparity
+from torchfovea.sensing.correspondence import Disparity
 from torchfovea.sensing.geometric import correspond_points
 from torchfovea.sensing.head import Gaze, eyes
 from torchfovea.sim.truth import truth_of
@@ -88,7 +88,7 @@ class Arena:
             )
             chosen = draw_fields(observer.retina.count, self.sample, generator)
             if chosen is not None:
-                matches = Correspondences(*(part[chosen] for part in matches))
+                matches = matches.take(chosen)
             return Look(matches, Pictures(left.image, right.image, found))
         left_px = observer.retina.centers_px(dtype=gaze.pan.dtype)
         chosen = draw_fields(observer.retina.count, self.sample, generator)

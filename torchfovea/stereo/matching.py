@@ -219,6 +219,6 @@ def correspondences(
     if retina is None:  # the RFs are the source's pixels
         square = torch.full_like(left_px[:, 0], budget.sigma_over_width**2 + budget.match_px**2)
         sigma = (square if clues is None else square + doubt(budget, clues)).sqrt()
-        return Correspondences(left_px, right_px, sigma, sigma, valid)
+        return Correspondences(left_px, right_px, sigma, sigma, valid, valid.to(sigma))
     left_sigma, right_sigma = (eye_sigma_px(budget, retina, px, clues) for px in (left_px, right_px))
-    return Correspondences(left_px, right_px, left_sigma, right_sigma, valid)
+    return Correspondences(left_px, right_px, left_sigma, right_sigma, valid, valid.to(left_sigma))

@@ -154,11 +154,12 @@ def match_sweep(
         eye_sigma_px(budget, retina, left_px).expand(batch, -1),
         (eye_sigma_px(budget, retina, right_px).square() + budget.claim**2 * match_px).sqrt(),
         valid,
+        valid.to(rho),
     )
     found = [torch.where(valid, x, zero) for x in (rho / length, sigma / length, correlation)]
     ranges = SweepRange(found[0], found[1], found[2], valid)
     if single:
-        return Correspondences(*(m[0] for m in matches)), SweepRange(*(r[0] for r in ranges))
+        return matches.take(0), SweepRange(*(r[0] for r in ranges))
     return matches, ranges
 
 

@@ -176,7 +176,7 @@ def stereo_cases(
     require(bool(found.any()), "ratios", ratios.tolist(), "disparities that some place of both retinas can show")
     ray = sensor.camera.rays(left_px)[:, 0]
     return StereoCases(
-        Correspondences(*(part[found] for part in matches)),
+        matches.take(found),
         Eyes(*(part[found] for part in pose)),
         sensor.camera,
         (points / points.norm(dim=-1, keepdim=True))[found],
