@@ -42,7 +42,8 @@ def gaussians(count: int, seed: int, dtype=torch.float64) -> Gaussian:
 def observed_at(direction: torch.Tensor, gaussian: Gaussian, support: float = 0.01) -> Observations:
     shape = direction.shape[:-1]
     support_rad = torch.full(shape, support, dtype=direction.dtype)
-    return Observations(gaussian.mean, gaussian.cov, direction, support_rad, torch.ones(shape, dtype=torch.bool))
+    valid = torch.ones(shape, dtype=torch.bool)
+    return Observations(gaussian.mean, gaussian.cov, direction, support_rad, valid, valid.to(direction))
 
 
 def nearnesses(rho: torch.Tensor, std: float, bearing_std: float = 1e-3) -> Gaussian:

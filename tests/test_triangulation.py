@@ -32,7 +32,9 @@ def stereo(points: torch.Tensor, sigma: float, gaze: Gaze | None = None, camera=
     left = camera.project(to_ego(pose.R_left.mT, points - pose.t_left))
     right = camera.project(to_ego(pose.R_right.mT, points - pose.t_right))
     spread = torch.full(points.shape[:-1], sigma, dtype=points.dtype)
-    return Correspondences(left, right, spread, spread, torch.ones(points.shape[:-1], dtype=torch.bool)), pose
+    return Correspondences(
+        left, right, spread, spread, torch.ones(points.shape[:-1], dtype=torch.bool), torch.ones_like(spread)
+    ), pose
 
 
 def cloud(

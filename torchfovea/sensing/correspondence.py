@@ -38,8 +38,9 @@ class Correspondences(NamedTuple):
 
     def take(self, index: int | Tensor) -> Correspondences:
         """Every part at an index of the first axis: some receptive fields (N,), or one row of a batch (B, N)."""
+        left_px, right_px, left_sigma, right_sigma, valid = (part[index] for part in self[:5])
         inlier = None if self.inlier is None else self.inlier[index]
-        return Correspondences(*(part[index] for part in self[:5]), inlier)
+        return Correspondences(left_px, right_px, left_sigma, right_sigma, valid, inlier)
 
 
 class Disparity(NamedTuple):
