@@ -222,6 +222,10 @@ def test_unknown_truth_is_left_out_and_nothing_is_an_error():
         (lambda: Budget(bend=-1.0), r"budget\.bend = -1"),
         (lambda: Budget(gap=math.inf), r"budget\.gap = inf"),
         (lambda: Budget(claim=math.nan), r"budget\.claim = nan"),
+        (lambda: Budget(shared=1.0), r"budget\.shared = 1\.0"),
+        (lambda: Budget(shared_px=-1.0), r"budget\.shared_px = -1"),
+        (lambda: Budget(shared_widths=math.inf), r"budget\.shared_widths = inf"),
+        (lambda: Budget(shared=0.2, lasting=0.3), r"budget\.lasting = 0\.3: expected 0 or more and not above"),
     ],
 )
 def test_impossible_numbers(make, line):

@@ -100,6 +100,13 @@ class Budget:
         gap: share of `Clues.gap_px`; 0: not asked.
         claim: factor on the standard deviation that a matcher itself claims (the sweep's curve of costs, a foreign
             matcher's confidence).
+        shared: share of a match's variance that neighbouring fields of one look have in common, because they see the
+            same pixels of the same surface; 0: independent, as in the paper. It fades with the distance of the fields,
+            with a length of `max(shared_px source pixels, shared_widths widths)`.
+        shared_px: see `shared` [source px].
+        shared_widths: see `shared` [widths of the receptive field].
+        lasting: share of the variance that another look at the same patch of surface has in common with this one; 0:
+            independent, as in the paper. Never more than `shared`.
     """
 
     sigma_over_width: float = 1 / 6
@@ -108,6 +115,10 @@ class Budget:
     bend: float = 0.0
     gap: float = 0.0
     claim: float = 1.0
+    shared: float = 0.0
+    shared_px: float = 4.0
+    shared_widths: float = 2.0
+    lasting: float = 0.0
 
     printed: ClassVar[Budget]
 
@@ -120,8 +131,15 @@ class Budget:
             self.source_px is None or self.source_px > 0, "sensor.source_px", self.source_px, "a positive number of px"
         )
         require(0 <= self.match_px < math.inf, "sensor.match_px", self.match_px, "0 or more source pixels")
-        for name in ("bend", "gap", "claim"):
+        for name in ("bend", "gap", "claim", "shared_px", "shared_widths"):
             require(0 <= getattr(self, name) < math.inf, f"budget.{name}", getattr(self, name), "0 or more")
+        require(0 <= self.shared < 1, "budget.shared", self.shared, "a share, 0 or more and less than 1")
+        require(
+            0 <= self.lasting <= self.shared,
+            "budget.lasting",
+            self.lasting,
+            f"0 or more and not above budget.shared = {self.shared:g}",
+        )
 
 
 Budget.printed = Budget(source_px=None, match_px=0.0)
