@@ -24,6 +24,7 @@ FLOORS = (
     ("topology", "sphere", "cell_index", "nearest"),
     (
         "correspondence",
+        "visibility",
         "confidence",
         "sgbm",
         "semiglobal",

@@ -53,6 +53,7 @@ class Disparity(NamedTuple):
         camera: the left view's.
         doffs_px: disparity of a point at infinity, negated (cx_right − cx_left): depth = focal · baseline/(d + doffs).
         baseline_m: distance between the eyes.
+        clues: of the readings at the receptive fields, (N,); None for a map that nobody read.
     """
 
     image: Tensor
@@ -61,6 +62,7 @@ class Disparity(NamedTuple):
     camera: Pinhole
     doffs_px: float
     baseline_m: float
+    clues: Clues | None = None
 
     def depth_m(self) -> Tensor:
         """Depth along the view's axis (H, W) [m]; inf where invalid or not in front."""
@@ -71,16 +73,33 @@ class Disparity(NamedTuple):
 
 
 class Clues(NamedTuple):
-    """What a disparity map tells of how far each of its readings can be trusted (`torchfovea.stereo.confidence`).
+    """What a matcher knows of how far each of its readings can be trusted, (..., N) in source px; detached.
+
+    Every matcher tells the first two where it tells any (`torchfovea.stereo.confidence`); None: it does not know. Only
+    meaningful where the correspondence is valid, finite everywhere.
 
     Attributes:
-        bend_px: (..., N) [source px], by how much the neighbourhood departs from a plane through the reading: a depth
-            edge, a fine structure, noise. A slant does not count.
-        gap_px: (..., N) [source px], how far the neighbourhood reaches times the share of it that has no disparity.
+        bend_px: by how much the neighbourhood departs from a plane through the reading: a depth edge, a fine structure,
+            noise. A slant does not count.
+        gap_px: how far the neighbourhood reaches times the share of it that has no disparity.
+        noise_px: the Cramér-Rao bound of the pair itself: the standard deviation of a disparity for what the two images
+            differ by in its window, over the window's gradient energy. Weak texture widens it.
+        mismatch: 1 less the correlation of the two windows, 0 to 2: the share of the contrast that the eyes do not
+            share, whatever their exposures.
+        hidden_px: disparity by which a nearer surface of the same map stands before the place where the right eye would
+            see the point; 0: nothing does.
     """
 
     bend_px: Tensor
     gap_px: Tensor
+    noise_px: Tensor | None = None
+    mismatch: Tensor | None = None
+    hidden_px: Tensor | None = None
+
+    def take(self, index: int | Tensor) -> Clues:
+        """Every clue at an index of the first axis."""
+        more = (None if clue is None else clue[index] for clue in self[2:])
+        return Clues(self.bend_px[index], self.gap_px[index], *more)
 
 
 @dataclass(frozen=True)

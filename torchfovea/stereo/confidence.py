@@ -1,4 +1,4 @@
-"""What a disparity map itself tells of how far its readings can be trusted.
+"""What a disparity map, or a field of inverse depths, itself tells of how far its readings can be trusted.
 
 Matchers err most at depth edges: a block that straddles one reports the nearer surface (foreground fattening), and
 beside a nearer surface lies what the right eye cannot see. Both show in the map: as a neighbourhood that is no plane,
@@ -9,18 +9,23 @@ Not differentiable.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import torch
 from torch import Tensor
 
+from torchfovea.gaussian import columns
 from torchfovea.sensing.correspondence import Clues, Disparity
+from torchfovea.sensing.layout import Retina
+from torchfovea.stereo.sheets import nearest_rf
 
-__all__ = ["BLOCK_PX", "read_clues"]
+__all__ = ["BLOCK_PX", "field_clues", "read_clues"]
 
 BLOCK_PX = 5.0
 """A neighbourhood reaches at least this far [px]: a matcher's block smears a depth edge over about its side."""
 
 DIRECTIONS = 8  # places around a reading, in opposite pairs
+REACH_WIDTHS = 3.0  # just past the window of five RFs that the sweep refines with
 
 
 def read_clues(disparity: Disparity, place: Tensor, shift: Tensor, width_px: Tensor) -> Clues:
@@ -55,3 +60,52 @@ def read_clues(disparity: Disparity, place: Tensor, shift: Tensor, width_px: Ten
         bend = torch.maximum(bend, torch.where(one_there & other_there, departs, torch.zeros_like(departs)))
         holes = holes + (~one_there).to(holes) + (~other_there).to(holes)
     return Clues(bend, radius * holes / DIRECTIONS)
+
+
+@torch.no_grad()
+def field_clues(values: Tensor, valid: Tensor, px_per_value: Tensor, retina: Retina, source_pitch_px: float) -> Clues:
+    """The same clues for readings that live on the RFs themselves.
+
+    Args:
+        values: (B, N), linear over the field on a plane, such as inverse depth.
+        valid: bool (B, N).
+        px_per_value: (B, N), the disparity that a unit of it makes [source px].
+        retina: the layout.
+        source_pitch_px: a source pixel in retinal pixels.
+
+    Returns:
+        Clues (B, N) as `read_clues`', on a circle of three widths (of the RF, or of a source pixel where that is
+        wider). What lies beyond the retina is no hole.
+    """
+    around, radius_px, on = _surroundings(retina, source_pitch_px, values.device)
+    bend, holes = torch.zeros_like(values), torch.zeros_like(values)
+    for k in range(DIRECTIONS // 2):
+        one, other = around[k], around[k + DIRECTIONS // 2]
+        departs = ((values[:, one] + values[:, other]) / 2 - values).abs()
+        both = valid[:, one] & valid[:, other]
+        bend = torch.maximum(bend, torch.where(both, departs, torch.zeros_like(departs)))
+        for which, there in ((k, one), (k + DIRECTIONS // 2, other)):
+            holes = holes + (on[which] & ~valid[:, there]).to(holes)
+    return Clues(bend * px_per_value, radius_px.to(holes) * holes / DIRECTIONS)
+
+
+@lru_cache(maxsize=16)
+def _surroundings(retina: Retina, source_pitch_px: float, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """The RFs around every RF, (8, N) int64; at which distance (N,) [source px]; which are on the retina, (8, N).
+
+    The second four mirror the first four, so that a slant cancels.
+    """
+    with torch.inference_mode(False), torch.no_grad():
+        centers = retina.centers_px(device, torch.float64)
+        radius = REACH_WIDTHS * retina.width_px(centers).clamp(min=source_pitch_px)
+        near, on = [], []
+        for k in range(DIRECTIONS // 2):
+            angle = math.tau * k / DIRECTIONS
+            place = centers + columns(radius * math.cos(angle), radius * math.sin(angle))
+            near.append(nearest_rf(retina, source_pitch_px, place))
+            on.append(retina.inside(place))
+        for k in range(DIRECTIONS // 2):
+            place = 2 * centers - centers[near[k]]
+            near.append(nearest_rf(retina, source_pitch_px, place))
+            on.append(retina.inside(place))
+        return torch.stack(near), radius / source_pitch_px, torch.stack(on)

@@ -263,7 +263,7 @@ def match_external(
     scale = size / (2 * retina.radius_px)
     clues = read_clues(field, place, shift, retina.width_px(left_px) * scale)
     matches = correspondences(left_px, right_px, found, retina, budget, clues)
-    return _doubt(matches, confidence, place, scale, params, budget.claim), field
+    return _doubt(matches, confidence, place, scale, params, budget.claim), field._replace(clues=clues)
 
 
 def _doubt(

@@ -108,7 +108,7 @@ def match_sgbm(
     looks = retina.inside(seen[0]) & camera.in_view(rays @ R_left)
     disparity = disparity._replace(image=disparity.image * looks, valid=disparity.valid & looks)
     clues = read_clues(disparity, place, shift, retina.width_px(left_px) * (size / (2 * retina.radius_px)))
-    return correspondences(left_px, right_px, found, retina, budget, clues), disparity
+    return correspondences(left_px, right_px, found, retina, budget, clues), disparity._replace(clues=clues)
 
 
 def grey_pair(left: Tensor | np.ndarray, right: Tensor | np.ndarray) -> Tensor:

@@ -106,7 +106,7 @@ def match_rectified(
         farthest_range_m=farthest_range_m,
         edge_px=params.edge_px,
     )
-    return found._replace(disparity=disparity)
+    return found._replace(disparity=disparity._replace(clues=found.disparity.clues))
 
 
 def match_disparity(
@@ -181,7 +181,7 @@ def match_disparity(
     width_px = torch.ones_like(shift) if retina is None else retina.width_px(left_px) * scale
     clues = read_clues(field, place, shift, width_px)
     matches = correspondences(left_px, right_px, found, retina, budget, clues)
-    return RectifiedMatch(matches, cameras[0], cameras[1], field)
+    return RectifiedMatch(matches, cameras[0], cameras[1], field._replace(clues=clues))
 
 
 def _doffs(camera_left: Pinhole, camera_right: Pinhole, baseline_m: float) -> float:

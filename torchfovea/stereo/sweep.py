@@ -26,14 +26,16 @@ from torch import Tensor
 
 from torchfovea.gaussian import columns
 from torchfovea.sensing.camera import Camera, Pinhole
-from torchfovea.sensing.correspondence import Budget, Correspondences, Disparity, eye_sigma_px
+from torchfovea.sensing.correspondence import Budget, Clues, Correspondences, Disparity, eye_sigma_px
 from torchfovea.sensing.layout import Retina
 from torchfovea.setting import require
+from torchfovea.stereo.confidence import field_clues
 from torchfovea.stereo.costs import Eye, acuity, project, sheet_rays
 from torchfovea.stereo.rectified import RectifiedMatch
 from torchfovea.stereo.rig import StereoRig
 from torchfovea.stereo.sheets import nearest_rf, sheets
 from torchfovea.stereo.surfaces import Sweep, match_sheet
+from torchfovea.stereo.visibility import unrivalled
 
 __all__ = ["Sweep", "SweepRange", "Volume", "match_sweep", "match_sweep_rectified"]
 
@@ -47,12 +49,14 @@ class SweepRange(NamedTuple):
             invalid.
         correlation: (..., N) of the neighbourhoods, up to 1; 0 where invalid.
         valid: bool (..., N).
+        clues: of how far each can be trusted (..., N).
     """
 
     inverse_range: Tensor
     sigma: Tensor
     correlation: Tensor
     valid: Tensor
+    clues: Clues
 
 
 class Volume(NamedTuple):
@@ -144,23 +148,30 @@ def match_sweep(
     slack = unit.detach()  # noise may carry a match past the last hypothesis
     valid = valid & (rho.detach() >= low - slack) & (rho.detach() <= high + slack)
     if params.left_right_widths < math.inf:
-        valid = _unrivalled(eye, rho.detach(), slack * params.left_right_widths, correlation.detach(), right_px, valid)
+        valid = unrivalled(eye, rho.detach(), slack * params.left_right_widths, correlation.detach(), right_px, valid)
     right_px = torch.where(valid[..., None], right_px, left_px)
     zero = torch.zeros_like(rho)
-    match_px = torch.where(valid, (u[:, 2] - u[:, 0]).square() + (v[:, 2] - v[:, 0]).square(), zero) / 4
+    square = (u[:, 2] - u[:, 0]).square() + (v[:, 2] - v[:, 0]).square()
+    match_px = torch.where(valid, square, zero) / 4
+    noise_px = match_px.detach().sqrt() * eye.scale
+    slope = torch.where(valid, noise_px / sigma.detach(), zero)
+    clues = field_clues(torch.where(valid, rho.detach(), zero), valid, slope, retina, 1 / eye.scale)
+    clues = clues._replace(noise_px=noise_px, mismatch=torch.where(valid, 1 - correlation.detach(), zero))
     matches = Correspondences(
         left_px.expand(batch, -1, -1),
         right_px,
-        eye_sigma_px(budget, retina, left_px).expand(batch, -1),
-        (eye_sigma_px(budget, retina, right_px).square() + budget.claim**2 * match_px).sqrt(),
+        eye_sigma_px(budget, retina, left_px, clues).expand(batch, -1),
+        (eye_sigma_px(budget, retina, right_px, clues).square() + budget.claim**2 * match_px).sqrt(),
         valid,
         valid.to(rho),
     )
-    found = [torch.where(valid, x, zero) for x in (rho / length, sigma / length, correlation)]
-    ranges = SweepRange(found[0], found[1], found[2], valid)
+    inverse_range, sigma, correlation = (
+        torch.where(valid, x, zero) for x in (rho / length, sigma / length, correlation)
+    )
     if single:
-        return matches.take(0), SweepRange(*(r[0] for r in ranges))
-    return matches, ranges
+        found = SweepRange(inverse_range[0], sigma[0], correlation[0], valid[0], clues.take(0))
+        return matches.take(0), found
+    return matches, SweepRange(inverse_range, sigma, correlation, valid, clues)
 
 
 def match_sweep_rectified(
@@ -208,7 +219,7 @@ def match_sweep_rectified(
         for camera in (camera_left, camera_right)
     )
     eye = torch.eye(3, dtype=torch.float64)
-    matches, _ = match_sweep(
+    matches, found = match_sweep(
         left,
         right,
         StereoRig(eye, eye, baseline_m),
@@ -230,7 +241,8 @@ def match_sweep_rectified(
     seen = matches.valid[rf] & retina.inside(place)
     disparity = torch.where(seen, shift[rf], torch.zeros_like(place[..., 0]))
     doffs = camera_right.cx_px - camera_left.cx_px
-    return RectifiedMatch(matches, mine, theirs, Disparity(grey, disparity, seen, camera_left, doffs, baseline_m))
+    field = Disparity(grey, disparity, seen, camera_left, doffs, baseline_m, found.clues)
+    return RectifiedMatch(matches, mine, theirs, field)
 
 
 def _pair(left: Tensor | np.ndarray, right: Tensor | np.ndarray) -> tuple[Tensor, bool]:
@@ -283,29 +295,3 @@ def _interval(volume: Volume, retina: Retina, length: Tensor, sigmas: float) -> 
     require(bool((volume.sigma > 0).all()), "volume.sigma", float(volume.sigma.min()), "more than 0")
     mean, half = (v.detach().to(length) for v in (volume.inverse_range, volume.sigma * sigmas))
     return (mean - half) * length, (mean + half) * length
-
-
-@torch.no_grad()
-def _unrivalled(eye: Eye, rho: Tensor, limit: Tensor, correlation: Tensor, right_px: Tensor, valid: Tensor) -> Tensor:
-    """Which RFs agree, to a limit, with the best correlated of those that claim their place of the right eye; (B, N).
-
-    This is the left-right check as semi-global matchers do it, from one sweep. Places are cells of a lattice for every
-    octave of RF widths; an RF asks that of its own octave, in which all RFs as narrow or narrower have their say.
-    """
-    retina, scale = eye.retina, eye.scale
-    width = torch.maximum(retina.width_px(right_px), retina.width_px(retina.centers_px(rho.device, rho.dtype)))
-    octave = torch.where(valid, torch.log2(width * scale).clamp(min=0).ceil(), torch.zeros_like(width)).long()
-    out = valid
-    for k in range(int(octave.max()) + 1):
-        pitch = 2.0**k / scale
-        reach = math.ceil(retina.radius_px / pitch)
-        side = 2 * reach + 1
-        column, row = ((right_px / pitch).round().clamp(-reach, reach).long() + reach).unbind(-1)
-        voter = valid & (octave <= k)
-        cell = torch.where(voter, row * side + column, side * side)
-        lowest = rho.new_full((len(rho), side * side + 1), -math.inf)
-        best = lowest.scatter_reduce(1, cell, correlation, "amax").gather(1, cell)
-        told = torch.where(voter & (correlation == best), rho, torch.full_like(rho, -math.inf))
-        theirs = lowest.scatter_reduce(1, cell, told, "amax").gather(1, cell)
-        out = out & ~(voter & (octave == k) & ((theirs - rho).abs() > limit))
-    return out
