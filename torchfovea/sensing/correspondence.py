@@ -82,6 +82,8 @@ class Clues(NamedTuple):
         bend_px: by how much the neighbourhood departs from a plane through the reading: a depth edge, a fine structure,
             noise. A slant does not count.
         gap_px: how far the neighbourhood reaches times the share of it that has no disparity.
+        fringe_px: by how much the reading is nearer than its neighbourhood, the one-sided bend: along the rim of a near
+            thing matchers report it a little beyond where it ends (foreground fattening).
         noise_px: the Cramér-Rao bound of the pair itself: the standard deviation of a disparity for what the two images
             differ by in its window, over the window's gradient energy. Weak texture widens it.
         mismatch: 1 less the correlation of the two windows, 0 to 2: the share of the contrast that the eyes do not
@@ -92,6 +94,7 @@ class Clues(NamedTuple):
 
     bend_px: Tensor
     gap_px: Tensor
+    fringe_px: Tensor | None = None
     noise_px: Tensor | None = None
     mismatch: Tensor | None = None
     hidden_px: Tensor | None = None

@@ -39,8 +39,8 @@ def read_clues(disparity: Disparity, place: Tensor, shift: Tensor, width_px: Ten
 
     Returns:
         Clues (N,): the bend is the largest difference of the reading from the mean of two opposite places, both with a
-        disparity, on a circle of radius √(width² + BLOCK_PX²); the gap is that radius times the share of
-        places without.
+        disparity, on a circle of radius √(width² + BLOCK_PX²); the fringe is the largest by which it is nearer than
+        that; the gap is that radius times the share of places without.
     """
     height, width = disparity.disparity.shape
     values, valid = disparity.disparity.flatten(), disparity.valid.flatten()
@@ -53,13 +53,13 @@ def read_clues(disparity: Disparity, place: Tensor, shift: Tensor, width_px: Ten
         index = row.clamp(0, height - 1).long() * width + column.clamp(0, width - 1).long()
         return values[index], valid[index] & on
 
-    bend, holes = torch.zeros_like(shift), torch.zeros_like(shift)
+    nearer, farther, holes = (torch.zeros_like(shift) for _ in range(3))
     for k in range(DIRECTIONS // 2):
         (one, one_there), (other, other_there) = (at(math.tau * (k / DIRECTIONS + half)) for half in (0.0, 0.5))
-        departs = ((one + other) / 2 - shift).abs()
-        bend = torch.maximum(bend, torch.where(one_there & other_there, departs, torch.zeros_like(departs)))
+        departs = torch.where(one_there & other_there, shift - (one + other) / 2, torch.zeros_like(shift))
+        nearer, farther = torch.maximum(nearer, departs), torch.maximum(farther, -departs)
         holes = holes + (~one_there).to(holes) + (~other_there).to(holes)
-    return Clues(bend, radius * holes / DIRECTIONS)
+    return Clues(torch.maximum(nearer, farther), radius * holes / DIRECTIONS, nearer)
 
 
 @torch.no_grad()
@@ -78,15 +78,16 @@ def field_clues(values: Tensor, valid: Tensor, px_per_value: Tensor, retina: Ret
         wider). What lies beyond the retina is no hole.
     """
     around, radius_px, on = _surroundings(retina, source_pitch_px, values.device)
-    bend, holes = torch.zeros_like(values), torch.zeros_like(values)
+    nearer, farther, holes = (torch.zeros_like(values) for _ in range(3))
     for k in range(DIRECTIONS // 2):
         one, other = around[k], around[k + DIRECTIONS // 2]
-        departs = ((values[:, one] + values[:, other]) / 2 - values).abs()
         both = valid[:, one] & valid[:, other]
-        bend = torch.maximum(bend, torch.where(both, departs, torch.zeros_like(departs)))
+        departs = torch.where(both, values - (values[:, one] + values[:, other]) / 2, torch.zeros_like(values))
+        nearer, farther = torch.maximum(nearer, departs), torch.maximum(farther, -departs)
         for which, there in ((k, one), (k + DIRECTIONS // 2, other)):
             holes = holes + (on[which] & ~valid[:, there]).to(holes)
-    return Clues(bend * px_per_value, radius_px.to(holes) * holes / DIRECTIONS)
+    gap_px = radius_px.to(holes) * holes / DIRECTIONS
+    return Clues(torch.maximum(nearer, farther) * px_per_value, gap_px, nearer * px_per_value)
 
 
 @lru_cache(maxsize=16)
