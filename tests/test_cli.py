@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -247,7 +246,9 @@ def test_doctor_limit_must_be_a_time(tmp_path, monkeypatch, capsys):
 @pytest.mark.skipif(os.name != "posix", reason="signals are POSIX")
 def test_ctrl_c(tmp_path):
     (tmp_path / "waiting.py").write_text(
-        "import sys, time\nfrom torchfovea.cli import COMMANDS, Command, main\n"
+        "import signal, sys, time\nfrom torchfovea.cli import COMMANDS, Command, main\n"
+        # as a terminal leaves it: a job in the background inherits it ignored
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "def run(cfg):\n    print('started', flush=True)\n    time.sleep(60)\n"
         "COMMANDS['doctor'] = Command('waiting:run', '', '')\n"
         "if __name__ == '__main__':\n    sys.exit(main(['doctor']))\n"
@@ -262,7 +263,6 @@ def test_ctrl_c(tmp_path):
         stderr=subprocess.PIPE,
     ) as process:
         assert process.stdout.readline() == "started\n"
-        time.sleep(0.2)
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=60)
     assert process.returncode == 130

@@ -245,6 +245,21 @@ def test_a_posed_rig_equals_a_verged_one():
     torch.testing.assert_close(a.right_px, b.right_px, atol=1e-6, rtol=0)
 
 
+@torch.no_grad()
+def steady(function, inputs):
+    """Which rows of the result stand on no border of a choice (of a winner, of what is valid): bool (N,).
+
+    A step across a border changes a row by some 1e-2. On one surface second differences of these steps stay below 1e-6.
+    """
+    generator, here = torch.Generator().manual_seed(0), function(*inputs)
+    keep = torch.ones(len(here), dtype=torch.bool)
+    for step in (1e-7, 1e-6, 1e-5) * 4:
+        moves = [step * torch.randn(i.shape, generator=generator, dtype=i.dtype) for i in inputs]
+        ahead, back = (function(*(i + sign * m for i, m in zip(inputs, moves, strict=True))) for sign in (1, -1))
+        keep &= ((ahead - 2 * here + back).abs() < 1e-5).all(-1)
+    return keep
+
+
 @pytest.mark.parametrize("retina", [LogPolar(120, rho_min_px=8.0), Uniform(120)], ids=["log_polar", "uniform"])
 def test_differentiable_from_images_to_gaussians(retina):
     room = Room([WALL], vergence=0.1)
@@ -253,21 +268,19 @@ def test_differentiable_from_images_to_gaussians(retina):
     eyes = Eyes(room.rig.R_left, origin[0], room.rig.R_right, origin[1])
     support = retina.width_px(retina.centers_px(dtype=torch.float64)) / 2
 
-    inputs = [i.clamp(0.02, 0.98).requires_grad_() for i in (left, right)]
-    # a match at a limit comes and goes with the last digit of an image
-    keep = match_sweep(*inputs, room.rig, room.camera, retina)[0].valid
-    for step in (-1e-6, 1e-6):
-        keep = keep & match_sweep(inputs[0] + step * left, inputs[1], room.rig, room.camera, retina)[0].valid
-
     def gaussians(left, right):
         matches, found = match_sweep(left, right, room.rig, room.camera, retina)
         seen = observe(matches, eyes, room.camera, support)
-        return seen.mean[keep], seen.cov[keep] * 1e3, found.inverse_range[keep], found.sigma[keep]
+        values = seen.mean, seen.cov * 1e3, found.inverse_range[:, None], found.sigma[:, None]
+        return seen.valid, torch.cat(values, -1)
 
-    outputs = gaussians(*inputs)
-    assert len(outputs[0]) > 20
-    assert torch.autograd.gradcheck(gaussians, inputs, eps=1e-7, atol=1e-4, rtol=1e-3, fast_mode=True)
-    gradients = torch.autograd.grad(sum(o.sum() for o in gaussians(*inputs)), inputs)
+    inputs = [i.clamp(0.02, 0.98).requires_grad_() for i in (left, right)]
+    valid, _ = gaussians(*inputs)
+    keep = valid & steady(lambda *images: gaussians(*images)[1], inputs)
+    assert keep.sum() > 20 and keep.sum() > 0.9 * valid.sum()
+    fixed = lambda *images: gaussians(*images)[1][keep]  # noqa: E731
+    assert torch.autograd.gradcheck(fixed, inputs, eps=1e-7, atol=1e-4, rtol=1e-3, fast_mode=True)
+    gradients = torch.autograd.grad(fixed(*inputs).sum(), inputs)
     assert all(g.isfinite().all() and g.abs().sum() > 0 for g in gradients)
 
 
