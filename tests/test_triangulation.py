@@ -309,6 +309,41 @@ def test_gradients(chart):
     assert torch.autograd.gradcheck(through, tuple(x.detach().clone().contiguous().requires_grad_() for x in inputs))
 
 
+NAN, INF = math.nan, math.inf
+
+
+@pytest.mark.parametrize("chart", ["inverse_range", "cartesian"])
+@pytest.mark.parametrize("camera", [CAMERA, Fisheye.from_fov(120.0, 100.0)], ids=["pin", "fish"])
+def test_what_is_not_valid_has_no_part_in_a_gradient(chart, camera):
+    """One ordinary match has the same gradients beside masked nonsense, and beside a claimed match without a sigma."""
+    clean, _ = stereo(torch.tensor([[1.2, 0.2, -0.1]], dtype=torch.float64), 0.3, camera=camera)
+    places = torch.tensor([[0.0, 0], [NAN, 3], [INF, 3], [3, -INF], [1e300, 0]], dtype=torch.float64)
+    place = places.repeat(5, 1)
+    sigma = torch.tensor([0.0, 0.3, NAN, INF, 1e300], dtype=torch.float64).repeat_interleave(5)
+    claimed = torch.arange(25) == 0
+    parts = (place, -place, sigma, sigma, claimed, torch.ones_like(sigma))
+    mixed = Correspondences(*(torch.cat(pair) for pair in zip(clean, parts, strict=True)))
+
+    def gradients(matches):
+        gaze = [torch.tensor(a, dtype=torch.float64, requires_grad=True) for a in (0.05, -0.02, 0.12)]
+        leaves = [t.clone().requires_grad_() for t in matches[:4]]
+        seen = observe(Correspondences(*leaves, *matches[4:]), eyes(HEAD, Gaze(*gaze)), camera, HALF, chart=chart)
+        assert seen.valid.tolist() == [True] + [False] * (len(seen.valid) - 1)
+        total = sum((part * part.detach()).sum() for part in seen[:4])
+        return seen, torch.autograd.grad(total, [*gaze, *leaves])
+
+    (_, alone), (seen, among) = gradients(clean), gradients(mixed)
+    for a, b in zip(alone[:3], among[:3], strict=True):
+        torch.testing.assert_close(b, a)
+    for a, b in zip(alone[3:], among[3:], strict=True):
+        torch.testing.assert_close(b[:1], a)
+        assert bool((b[1:] == 0).all())
+    plain = observe(mixed, eyes(HEAD, Gaze(*torch.tensor([0.05, -0.02, 0.12]).double())), camera, HALF, chart=chart)
+    for part, learned in zip(plain[:4], seen[:4], strict=True):
+        assert bool(part.isfinite().all())
+        torch.testing.assert_close(part[0], learned[0])
+
+
 def test_unknown_chart_is_an_error():
     matches, pose = stereo(cloud(1, 0), 0.1)
     with pytest.raises(SettingError, match="chart = polar"):

@@ -12,7 +12,7 @@ from torchfovea.gaussian import columns, definiteness, pack, positive_definite, 
 from torchfovea.sensing.unscented import SigmaPoints, unscented_transform
 from torchfovea.setting import SettingError
 
-CHOICES = [SigmaPoints(), SigmaPoints.paper()]
+CHOICES = [SigmaPoints(), SigmaPoints.paper(), SigmaPoints.midpoint()]
 
 
 def full(packed: torch.Tensor, m: int) -> torch.Tensor:
@@ -51,6 +51,12 @@ def test_transform_is_filterpys(points):
         want_mean, want_cov = filterpy_transform(images, peer.Wm, peer.Wc)
         # filterpy takes the upper Cholesky factor's rows, that is the lower one's columns: the same points
         np.testing.assert_allclose(got_mean[i], want_mean, rtol=1e-9)
+        if points.by_axis:  # the covariances of filterpy's transforms of one dimension, added up
+            line = MerweScaledSigmaPoints(1, 1.0, 0.0, 2.0)
+            want_cov = np.zeros((3, 3))
+            for column in root[i].T:
+                places = mean[i] + line.sigma_points(np.zeros(1), np.eye(1)) * column
+                want_cov += filterpy_transform(bend(torch.from_numpy(places)).numpy(), line.Wm, line.Wc)[1]
         np.testing.assert_allclose(full(got_cov, 3)[i], want_cov, rtol=1e-7, atol=1e-12)
 
 
@@ -63,6 +69,30 @@ def test_exact_for_affine_maps(points, seed):
     got_mean, got_cov, _ = unscented_transform(lambda x: x @ matrix.T + shift, mean, root, points)
     torch.testing.assert_close(got_mean, mean @ matrix.T + shift)
     torch.testing.assert_close(full(got_cov, 3), matrix @ root @ root.mT @ matrix.T, rtol=1e-8, atol=1e-8)
+
+
+def test_the_variance_of_a_sum_of_squares_is_right(dtype):
+    def chi_square(x):
+        return x.square().sum(-1, keepdim=True)
+
+    mean, variance, _ = unscented_transform(
+        chi_square, torch.zeros(4, dtype=dtype), torch.eye(4, dtype=dtype), SigmaPoints()
+    )
+    assert (mean.item(), variance.item()) == (pytest.approx(4, rel=1e-6), pytest.approx(8, rel=1e-6))
+
+
+@pytest.mark.parametrize("points", [*CHOICES, SigmaPoints(3, kappa=0.0), SigmaPoints(2, 1.0, 0.0, -1.0)], ids=str)
+def test_no_variance_is_negative(points):
+    rng = torch.Generator().manual_seed(0)
+    n = points.dimensions
+    form = torch.randn(500, n, n, generator=rng, dtype=torch.float64) + torch.randn(500, 1, 1, generator=rng)
+    mean, root = (torch.randn(500, *s, generator=rng, dtype=torch.float64) for s in ((n,), (n, n)))
+
+    def bend(x):
+        return torch.stack([(x * (form @ x[..., None])[..., 0]).sum(-1), x[..., 0]], -1)
+
+    _, cov, _ = unscented_transform(bend, mean, root, points)
+    assert float(torch.linalg.eigvalsh(full(cov, 2))[:, 0].min()) > -1e-9
 
 
 def test_float32_keeps_its_digits_with_the_papers_weights():
@@ -86,6 +116,11 @@ def test_errors_name_the_setting():
         SigmaPoints(4, kappa=-4)
     with pytest.raises(SettingError, match=r"sigma_points.alpha = 0"):
         SigmaPoints(alpha=0)
+    with pytest.raises(SettingError, match=r"sigma_points.beta = 0.0: expected at least 0.875"):
+        SigmaPoints(4, 1.0, 0.0, -3.5)
+    for name in ("alpha", "beta", "kappa"):
+        with pytest.raises(SettingError, match=f"sigma_points.{name} = nan"):
+            SigmaPoints(**{name: float("nan")})
     with pytest.raises(SettingError, match=r"sigma_points.dimensions = 4: expected 2"):
         unscented_transform(lambda x: x, torch.zeros(1, 2), torch.eye(2)[None], SigmaPoints())
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -189,6 +190,8 @@ def observe(
         transform = partial(_transform_form, form=_form(rig, cameras[0], cameras[1]), points=points, rotated=rotated)
     size = count
     learning = torch.is_grad_enabled() and any(t.requires_grad for t in (*matches[:4], *eyes))
+    if learning:
+        matches = _safe(matches, cameras, transform)
     if matches.valid.device.type == "cpu" and not learning:
         size = -(-count // max(1, round(matches.valid.numel() / (BLOCK * torch.get_num_threads()))))
     parts = []
@@ -201,7 +204,22 @@ def observe(
     support = support_px / camera.focal_px * torch.addcmul(torch.addcmul(z * z, x, x), y, y).rsqrt()
     mean, cov = value[:3].movedim(0, -1), value[3:].movedim(0, -1)
     inlier = valid.to(mean.dtype) if matches.inlier is None else matches.inlier
-    return Observations(mean, cov, direction.movedim(0, -1), support.expand(valid.shape), valid, inlier)
+    support = torch.where(valid, support, torch.ones_like(support))
+    return Observations(mean, cov, direction.movedim(0, -1), support, valid, inlier)
+
+
+def _safe(
+    matches: Correspondences, cameras: tuple[Camera, Camera], transform: Callable[[Correspondences], _Moments]
+) -> Correspondences:
+    """Ordinary values in place of those that will not be valid, whose gradients might not be finite even times 0."""
+    with torch.no_grad():
+        keep = _settled(matches, *transform(matches))[2]
+    if bool(keep.all()):
+        return matches
+    ahead = [matches.left_px.new_tensor([camera.cx_px, camera.cy_px]) for camera in cameras]
+    places = (torch.where(keep[..., None], px, a) for px, a in zip(matches[:2], ahead, strict=True))
+    sigmas = (torch.where(keep, sigma, torch.ones_like(sigma)) for sigma in matches[2:4])
+    return Correspondences(*places, *sigmas, keep, matches.inlier)
 
 
 # of the images of the sigma points: mean and covariance by components, the direction of the central one (3, ..., N),
@@ -298,4 +316,6 @@ def _settled(
         gone = 1 - keep.to(ahead.dtype)
     value = torch.stack([*first, *second])
     unit = value.new_tensor([1.0, 1, 1, 1, 0, 0, 1, 0, 1]).reshape(-1, *[1] * gone.dim())
-    return torch.addcmul((value * (1 - gone)).nan_to_num(0.0, 0.0, 0.0), unit, gone), direction, keep
+    forward = direction.new_tensor([1.0, 0, 0]).reshape(-1, *[1] * gone.dim())
+    value = torch.addcmul((value * (1 - gone)).nan_to_num(0.0, 0.0, 0.0), unit, gone)
+    return value, torch.where(keep, direction, forward), keep

@@ -7,6 +7,7 @@ References:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -36,6 +37,11 @@ class SigmaPoints:
     The default puts them at ±√3 standard deviations with equal weights for mean and covariance. Along each axis of the
     square root that is three-point Gauss-Hermite quadrature, exact to fifth order. The paper's choice is `paper()`.
 
+    With a negative weight of the centre, Eq. 18 may give a negative variance: −4 for the default and |x|² of four
+    standard normals, where 8 is right. Where that can happen (`by_axis`) the covariances of the one-dimensional
+    quadratures add up instead, as they do for a function that is a sum over the axes; for such it is exact as far as
+    they are. Where only one axis is curved, both are the same.
+
     Attributes:
         dimensions: n, of the input.
         alpha: spread (Eq. 14-16), > 0.
@@ -58,6 +64,15 @@ class SigmaPoints:
             self.kappa,
             f"more than -{self.dimensions}, so that dimensions + kappa is positive",
         )
+        for name in ("alpha", "beta", "kappa"):
+            require(math.isfinite(getattr(self, name)), f"sigma_points.{name}", getattr(self, name), "a finite number")
+        require(
+            not self.by_axis or self.spread >= 1,
+            "sigma_points.beta",
+            self.beta,
+            f"at least {-(self.alpha**2) * self.kappa / self.dimensions:g}, or points at a standard deviation or more: "
+            "otherwise variances may be negative",
+        )
 
     @staticmethod
     def paper() -> SigmaPoints:
@@ -78,6 +93,14 @@ class SigmaPoints:
     def spread(self) -> float:
         """√(L + λ), the distance of the sigma points in standard deviations (Eq. 11-12)."""
         return self.alpha * (self.dimensions + self.kappa) ** 0.5
+
+    @property
+    def by_axis(self) -> bool:
+        """Whether Eq. 18 may give a negative variance, so that variances are those along each axis, added up.
+
+        Σ w_c (δ − s)(δ − s)ᵀ = w Σ δδᵀ + (β − α²) s sᵀ with s = w Σ δ, and s sᵀ is at most n/spread² of the first term.
+        """
+        return self.beta < -(self.alpha**2) * self.kappa / self.dimensions
 
     @cached_property
     def weights(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -155,17 +178,27 @@ def moments(image: Sequence[Tensor], points: SigmaPoints) -> tuple[list[Tensor],
 
 
 def moments_of_differences(delta: Sequence[Tensor], points: SigmaPoints) -> tuple[list[Tensor], list[Tensor]]:
-    """`moments` from the differences δ to the central image, m components (2n, ...); the mean less that image."""
-    # δ₀ = 0 and the other weights are all one w (Eq. 16), for mean and covariance alike: with s = w Σ δ,
-    # Σ w (δ − s)(δ − s)ᵀ = w Σ δ δᵀ + (Σ w_c − 2) s sᵀ, the sum of the weights including the centre's
+    """`moments` from the differences δ to the central image, m components (2n, ...); the mean less that image.
+
+    The images of the points ahead on every axis come first, then those of the points behind.
+    """
+    # δ₀ = 0 and the other weights are all one w (Eq. 16), for mean and covariance alike
     weights_mean, weights_cov = points.weights
-    weight, rest = weights_mean[1], sum(weights_cov) - 2
+    weight, pairs = weights_mean[1], [(i, j) for i in range(len(delta)) for j in range(i, len(delta))]
+    if points.by_axis:
+        # with the even part e = δ₊ + δ₋ and the odd part o = δ₊ − δ₋ of an axis, its quadrature's covariance is
+        # w (δ₊δ₊ᵀ + δ₋δ₋ᵀ) − w² e eᵀ = w/2 (o oᵀ + (1 − 2w) e eᵀ): squares alone, for w ≤ 1/2
+        halves = [d.unflatten(0, (2, -1)).unbind(0) for d in delta]
+        even, odd = [a + b for a, b in halves], [a - b for a, b in halves]
+        scale = weight / 2 * (1 - 2 * weight)
+        second = [
+            ((odd[i] * odd[j]).sum(0) * (weight / 2)).add_((even[i] * even[j]).sum(0), alpha=scale) for i, j in pairs
+        ]
+        return [e.sum(0) * weight for e in even], second
+    # with s = w Σ δ, Σ w (δ − s)(δ − s)ᵀ = w Σ δ δᵀ + (Σ w_c − 2) s sᵀ, the sum of the weights with the centre's
+    rest = sum(weights_cov) - 2
     shift = [component.sum(0) * weight for component in delta]
-    second = [
-        ((delta[i] * delta[j]).sum(0) * weight).addcmul_(shift[i], shift[j], value=rest)
-        for i in range(len(delta))
-        for j in range(i, len(delta))
-    ]
+    second = [((delta[i] * delta[j]).sum(0) * weight).addcmul_(shift[i], shift[j], value=rest) for i, j in pairs]
     return shift, second
 
 
