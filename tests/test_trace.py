@@ -1,5 +1,7 @@
 """Rays traced as tensors meet what MuJoCo's rays meet, and arenas sensed together are arenas sensed alone."""
 
+import math
+
 import pytest
 import torch
 
@@ -8,6 +10,7 @@ from torchfovea.perception import Observer
 from torchfovea.sensing.camera import Pinhole
 from torchfovea.sensing.head import Gaze, eyes, to_ego
 from torchfovea.sensing.layout import LogPolar, Uniform
+from torchfovea.setting import SettingError
 from torchfovea.sim.arena import Arena, draw_fields
 from torchfovea.sim.arenas import GeometricArenas
 from torchfovea.sim.cans import Cans
@@ -60,6 +63,38 @@ def test_float32_is_near_float64(scenes, gaze):
     double, _ = trace(solids_of(scenes), origin.double(), direction.double())
     assert single.dtype == torch.float32
     assert ((single - double).abs() < 1e-3).double().mean() > 0.99
+
+
+def test_directions_of_any_length(scenes, gaze, dtype):
+    rng = torch.Generator().manual_seed(0)
+    direction = torch.randn(3, 500, 3, generator=rng, dtype=torch.float64).to(dtype)
+    solids, origin = solids_of(scenes, dtype=dtype), torch.zeros(3, 3, dtype=dtype)
+    unit = torch.nn.functional.normalize(direction, dim=-1)
+    for length in (2.0, 1e-3, 1e6):
+        for got, want in zip(trace(solids, origin, length * unit), trace(solids, origin, unit), strict=True):
+            assert ((got - want).abs() <= 1e-5).double().mean() > 0.99
+    for bad in (0.0, math.nan, math.inf):
+        with pytest.raises(SettingError, match="directions_e"):
+            trace(solids, origin, bad * unit)
+
+
+@pytest.mark.parametrize("beside_m", [0.0, 0.9, 1.01])
+def test_rays_along_an_axis(scenes, beside_m, dtype):
+    """From below the furniture's height, beside and under cans, up, down and level: what MuJoCo meets."""
+    axes = torch.cat([torch.eye(3), -torch.eye(3)]).to(dtype)
+    solids, checked = solids_of(scenes[:1], dtype=dtype), 0
+    rotation, translation = (torch.from_numpy(x) for x in scenes[0].world_from_ego)
+    for solid in scenes[0].solids:
+        if solid.shape == "cylinder":
+            radius_m, half_m = solid.size_m[:2]
+            shift = torch.tensor([0.0, beside_m * radius_m, half_m + 0.02], dtype=torch.float64)
+            place = rotation.T @ (torch.tensor(solid.position_m, dtype=torch.float64) + shift - translation)
+            range_m, _ = trace(solids, place.to(dtype)[None], axes[None])
+            hits = cast(scenes[0], place, axes.double())
+            torch.testing.assert_close(range_m[0].double(), hits.range_m, atol=1e-5, rtol=1e-5)
+            checked += 1
+    assert checked > 2
+    assert not occluded(solids, torch.zeros(1, 3, dtype=dtype), torch.zeros(1, 4, 3, dtype=dtype)).any()
 
 
 @pytest.mark.parametrize("sample", [None, 300])

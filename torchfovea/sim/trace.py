@@ -20,7 +20,10 @@ from torchfovea.sim.room import FLOOR, ROOM, Solid
 
 __all__ = ["Solids", "occluded", "ranges", "solids_of", "trace"]
 
-_TINY = 1e-300
+
+def _tiny(dtype: torch.dtype) -> float:
+    """A step that stands for none: its inverse times any length in a scene is finite."""
+    return torch.finfo(dtype).tiny * 1e8
 
 
 class _Group(NamedTuple):
@@ -162,7 +165,8 @@ class _Pairs(NamedTuple):
 
 
 def _inverse(step: Tensor) -> Tensor:
-    return 1 / torch.where(step.abs() > _TINY, step, torch.full_like(step, _TINY))
+    tiny = _tiny(step.dtype)
+    return 1 / torch.where(step.abs() > tiny, step, torch.full_like(step, tiny))
 
 
 def _slab(middle: Tensor, half: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor]:
@@ -208,10 +212,12 @@ def _pairs(solids: Solids, rays: _Rays) -> list[_Pairs]:
                 _slab(rz, sz, _inverse(dz)),
             ]
         elif kind == "cylinder":
-            a = (dx * dx + dy * dy).clamp(min=_TINY)
-            middle, cross = (dx * rx + dy * ry) / a, dx * ry - dy * rx
-            inside = sx * sx * a - cross * cross
-            half = inside.clamp(min=0).sqrt() / a
+            a = dx * dx + dy * dy
+            upright = a <= _tiny(a.dtype)  # along the axis: inside all the way, or nowhere
+            a, cross = torch.where(upright, torch.ones_like(a), a), dx * ry - dy * rx
+            middle = torch.where(upright, torch.zeros_like(a), (dx * rx + dy * ry) / a)
+            inside = torch.where(upright, sx * sx - rx * rx - ry * ry, sx * sx * a - cross * cross)
+            half = torch.where(upright, torch.full_like(a, torch.inf), inside.clamp(min=0).sqrt() / a)
             ends = [(torch.where(inside >= 0, middle - half, torch.inf), middle + half), _slab(rz, sy, _inverse(dz))]
         else:
             along = dx * rx + dy * ry + dz * rz
@@ -237,13 +243,13 @@ def trace(solids: Solids, origin_e: Tensor, directions_e: Tensor) -> tuple[Tenso
     Args:
         solids: B scenes.
         origin_e: (B, 3) in E [m].
-        directions_e: unit, (B, N, 3) in E.
+        directions_e: (B, N, 3) in E, of any positive length.
 
     Returns:
         Ranges (B, N) [m] and geoms (B, N); in the solids' dtype.
 
     Raises:
-        SettingError: for an origin outside of its room.
+        SettingError: for an origin outside of its room, and directions that are zero or not finite.
     """
     range_m, leave, rays, met = _ranges(solids, origin_e, directions_e)
     # by which face the room is left
@@ -264,6 +270,10 @@ def ranges(solids: Solids, origin_e: Tensor, directions_e: Tensor) -> Tensor:
 
 def _ranges(solids: Solids, origin_e: Tensor, directions_e: Tensor) -> tuple[Tensor, list[Tensor], _Rays, list[_Pairs]]:
     """Ranges (B, N), where each pair of faces is left, and what led there."""
+    length = torch.linalg.vector_norm(directions_e.to(solids.rotation), dim=-1)
+    whole = bool(((length > 0) & (length < torch.inf)).all())
+    require(whole, "directions_e", "zero or not finite", "directions")
+    directions_e = directions_e.to(solids.rotation) / length[..., None]
     rays = _world(solids, origin_e, directions_e)
     offset = [middle - o for middle, o in zip(solids.middle, rays.origin, strict=True)]
     inside = bool(torch.stack([h - o.abs() for h, o in zip(solids.half, offset, strict=True)]).amin() > 0)
@@ -289,7 +299,7 @@ def occluded(solids: Solids, origin_e: Tensor, points_e: Tensor) -> Tensor:
     dtype = solids.rotation.dtype
     line = points_e.to(dtype) - origin_e.to(dtype)[:, None]
     away = (line * line).sum(-1).sqrt()
-    rays = _world(solids, origin_e, line / away[..., None])
+    rays = _world(solids, origin_e, line / away.clamp(min=_tiny(dtype))[..., None])
     hidden = torch.zeros(away.numel(), dtype=torch.bool, device=away.device)
     # a point's own surface is met at the point itself, but for rounding at grazing incidence
     limit = (away - (1e-5 + 1e-5 * away)).reshape(-1)
