@@ -179,7 +179,45 @@ def test_incumbent_of_each_row(function):
     mean, std = belief(2, 3, 5)
     incumbent = torch.arange(6.0).reshape(2, 3)
     rows = [function(mean[i, j], std[i, j], incumbent[i, j].item()) for i in range(2) for j in range(3)]
-    assert torch.equal(function(mean, std, incumbent), torch.stack(rows).reshape(2, 3, 5))
+    want = torch.stack(rows).reshape(2, 3, 5)
+    torch.testing.assert_close(function(mean, std, incumbent), want, rtol=1e-13, atol=1e-300)
+
+
+@pytest.mark.parametrize("function", [*LOGS, *PLAIN, aq.upper_confidence_bound, aq.thompson])
+def test_shapes_that_do_not_belong_together_are_named(function):
+    def call(mean, std, row=0.0):
+        mean, std = torch.zeros(mean), torch.ones(std)
+        return function(mean, std, generator() if function is aq.thompson else row)
+
+    assert call((4, 1), (4, 1)).shape == (4, 1)
+    for mean, std in (((4, 1), (4,)), ((4,), (4, 1)), ((2, 4), (2, 3))):
+        with pytest.raises(SettingError, match=r"std\.shape"):
+            call(mean, std)
+    if function is not aq.thompson:
+        assert call((4, 3), (4, 3), torch.ones(4)).shape == (4, 3)
+        for mean, row in (((4,), (4,)), ((2, 4), (3,)), ((2, 4), (2, 1))):
+            with pytest.raises(SettingError, match=r"(incumbent|alpha)\.shape"):
+                call(mean, mean, torch.ones(row))
+
+
+@dtypes
+@pytest.mark.parametrize("std", [1e-10, 1e-12, 1e-15])
+def test_the_smallest_deviations_are_themselves(std, dtype):
+    """EI(0) = σ φ(0), PI(0) = 1/2 and what follows a few σ off, for a σ whose fourth power underflows in float32."""
+    for z in (0.0, 1.0, -2.0, -6.0):
+        deviation = torch.tensor([std], dtype=dtype)
+        density, above = stats.norm.pdf(z), stats.norm.cdf(z)
+        want = {
+            aq.expected_improvement: std * (z * above + density),
+            aq.log_expected_improvement: math.log(std) + math.log(z * above + density),
+            aq.probability_of_improvement: above,
+            aq.log_probability_of_improvement: math.log(above),
+        }
+        for function, value in want.items():
+            leaves = [(z * deviation).requires_grad_(), deviation.clone().requires_grad_()]
+            got = function(*leaves, 0.0)
+            assert got.item() == pytest.approx(value, rel=1e-4)
+            assert all(torch.isfinite(g).all() for g in torch.autograd.grad(got.sum(), leaves))
 
 
 def test_upper_confidence_bound():
@@ -190,7 +228,7 @@ def test_upper_confidence_bound():
     score = aq.upper_confidence_bound(mean, std, alpha)
     assert torch.equal(score, torch.stack([mean[0], mean[1] + 2 * std[1], std[2]]))
     (gradient,) = torch.autograd.grad(score.sum(), alpha)
-    assert torch.equal(gradient, torch.stack([std[0].sum(), std[1].sum(), 0 * std[0, 0]]))
+    torch.testing.assert_close(gradient, torch.stack([std[0].sum(), std[1].sum(), 0 * std[0, 0]]))
     assert torch.equal(aq.upper_confidence_bound(mean, std, torch.tensor(2.0)), mean + 2 * std)
     for bad in (-1.0, math.nan):
         with pytest.raises(SettingError, match=r"acquisition\.alpha"):

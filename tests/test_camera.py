@@ -86,3 +86,11 @@ def test_a_pinholes_rays_are_linear_in_its_pixels():
     turn = torch.linalg.matrix_exp(torch.tensor([[0, 0.3, 0], [-0.3, 0, 0.1], [0, -0.1, 0]], dtype=torch.float64))
     got = torch.cat([px, torch.ones(2, 1, dtype=torch.float64)], -1) @ camera.turned(turn).mT
     torch.testing.assert_close(got, camera.rays(px) @ turn.mT)
+
+
+@pytest.mark.parametrize("kind", [Pinhole, Fisheye])
+def test_a_camera_has_finite_numbers(kind):
+    for name in ("focal_px", "cx_px", "cy_px"):
+        for value in (math.nan, math.inf):
+            with pytest.raises(SettingError, match=f"{name} = {value}"):
+                kind(**{"focal_px": 1.0, name: value})

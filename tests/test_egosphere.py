@@ -467,3 +467,35 @@ def test_a_million_cells(generator):
 def test_errors_name_the_setting(call, message):
     with pytest.raises(SettingError, match=message):
         call()
+
+
+@pytest.mark.parametrize("fusion", ["inverse_range", "aligned"])
+def test_a_memory_keeps_its_dtype(fusion):
+    cells = fibonacci_directions(40).float()
+    how, seen = Fusion(name=fusion), observed_at(fibonacci_directions(40), gaussians(40, 0))
+    memory, index, spacing = new_egosphere(cells, Prior(), how.chart), build_index(cells), neighbour_spacing_rad(cells)
+    common = torch.full((40, 6), 1e-6, dtype=torch.float64)
+    rough = Observations(*(part.float() if part.is_floating_point() else part for part in seen))
+    double = remember(memory, index, spacing, seen, how, Prior(), common)
+    single = remember(memory, index, spacing, rough, how, Prior(), common.float())
+    for a, b in zip(double.information, single.information, strict=True):
+        assert a.dtype == torch.float32
+        torch.testing.assert_close(a, b)
+    assert double.bearing.dtype == double.looks.dtype == torch.float32
+
+
+def test_priors_and_charts_that_float32_cannot_hold_are_named():
+    for name in ("mean", "std", "bearing_std", "slope_std"):
+        for value in (1e20, 1e-20, 0.0, math.nan, math.inf):
+            with pytest.raises(SettingError, match=f"prior.{name}"):
+                Prior(**{name: value})
+    cells = fibonacci_directions(20).float()
+    for size in (1e-9, 1e9):
+        prior = Prior(std=size, bearing_std=size, slope_std=size)
+        for chart in ("inverse_range", "cartesian"):
+            moments = belief(new_egosphere(cells, prior, chart))
+            assert all(bool(part.isfinite().all()) for part in moments)
+    with pytest.raises(SettingError, match="chart = polar"):
+        new_egosphere(cells, Prior(), "polar")
+    with pytest.raises(SettingError, match=r"fusion.fill = no"):
+        Fusion(fill="no")

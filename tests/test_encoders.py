@@ -72,3 +72,18 @@ def test_batches_dtypes_and_gradients(dtype):
 def test_errors(sigma, chart, message):
     with pytest.raises(SettingError, match=message):
         encoder_covariance(POINTS, eyes(HEAD, fixate(HEAD, POINTS[0])[0]), sigma, chart)
+
+
+@pytest.mark.parametrize("chart", ["cartesian", "inverse_range"])
+def test_the_origin_and_the_baseline_are_finite(chart, dtype):
+    """Beside them, where rounding does not reach, it is the ordinary covariance."""
+    pose = eyes(HEAD, Gaze(*torch.zeros(3, dtype=dtype)))
+    axis = pose.t_right - pose.t_left
+    points = torch.stack([0 * axis, pose.t_left - axis, pose.t_left, 1e-20 * axis, POINTS[0].to(dtype)])
+    leaf = points.clone().requires_grad_()
+    cov = encoder_covariance(leaf, pose, SIGMA, chart)
+    (gradient,) = torch.autograd.grad(cov.sum(), leaf)
+    assert bool(cov.isfinite().all()) and bool(gradient.isfinite().all())
+    torch.testing.assert_close(cov[4], encoder_covariance(POINTS[:1].to(dtype), pose, SIGMA, chart)[0])
+    turns = encoder_jacobian(points, pose)
+    assert bool((turns[0][0] == 0).all()) and bool((turns[1][0] == 0).all())

@@ -67,7 +67,27 @@ def test_unreachable_is_an_answer():
     for angle, limit in zip(gaze, (53, 37, 40), strict=True):
         assert bool(torch.isfinite(angle).all()) and angle.abs().max() <= math.radians(limit) + 1e-12
     sum(a.sum() for a in gaze).backward()
-    assert bool(torch.isfinite(points.grad).all())
+    assert bool((points.grad[:9] == 0).all()) and bool(torch.isfinite(points.grad).all())
+    assert points.grad[9].tolist() == pytest.approx([-0.3529, 1, -1], abs=1e-4)
+
+
+def test_far_points_have_their_angles(dtype):
+    """As far as numbers go: a quarter up is out of reach, 30 degrees to the side and down are not."""
+    way = torch.tensor([[1.0, 0, 1.0], [0.866, 0.5, 0], [0.866, 0, -0.5]], dtype=dtype)
+    for far in (1e3, 1e20, 1e37):
+        gaze, reachable = fixate(VIZZY, far * way)
+        assert reachable.tolist() == [False, True, True]
+        angles = torch.rad2deg(torch.stack(list(gaze), -1))[1:].tolist()
+        assert angles[0] == pytest.approx([30, 0, 0], abs=0.03) and angles[1] == pytest.approx([0, 30, 0], abs=0.03)
+
+
+def test_points_and_gazes_of_another_kind_are_named():
+    for bad in (torch.zeros(5, 2), torch.zeros(()), torch.zeros(5, 3, dtype=torch.int64)):
+        with pytest.raises(SettingError, match="point = "):
+            fixate(VIZZY, bad)
+    zero = torch.zeros(2)
+    with pytest.raises(SettingError, match=r"gaze\.dtype"):
+        eyes(VIZZY, Gaze(zero, zero.double(), zero))
 
 
 def test_the_authors_target_is_just_within_reach():
@@ -106,6 +126,7 @@ def test_clamp():
         ("tilt_down_deg", 90.0),
         ("vergence_max_deg", 0.0),
         ("eyes_up_m", math.inf),
+        ("baseline_m", math.inf),
     ],
 )
 def test_errors_name_the_setting(setting, value):

@@ -79,6 +79,23 @@ def test_the_rig_frame_of_a_head_is_cyclopean():
         rig_frame(apart._replace(t_right=apart.t_left))
 
 
+def test_rays_of_any_length_meet_where_they_do_and_nearly_parallel_ones_are_finite(dtype):
+    t_left, t_right = (torch.tensor([x, 0.0, 0], dtype=dtype) for x in (-0.1, 0.1))
+    left, right = (torch.tensor([x, 0.0, 1], dtype=dtype) for x in (0.1, -0.1))
+    for long, short in ((1.0, 1.0), (1e-30, 1e30), (1e-18, 1e-18), (1e15, 1e-20)):
+        point, front = triangulate(long * left, short * right, t_left, t_right)
+        assert front.item()
+        torch.testing.assert_close(point, torch.tensor([0.0, 0, 1], dtype=dtype))
+    for tilt in 10.0 ** torch.arange(-45, 0, dtype=torch.float64):
+        nearly = torch.stack([tilt, 0 * tilt, tilt**0]).to(dtype).requires_grad_()
+        point, front = triangulate(nearly, torch.tensor([0.0, 0, 1], dtype=dtype), t_left, t_right)
+        (gradient,) = torch.autograd.grad(point[2], nearly)
+        assert bool(point.isfinite().all())
+        assert bool(gradient.isfinite().all()) and front.item() == (float(tilt) > torch.finfo(dtype).eps)
+        if front:
+            assert point[2].item() == pytest.approx(0.2 / float(tilt), rel=1e-5)
+
+
 def test_vertical_noise_does_not_touch_the_depth():
     left = torch.tensor([[0.3, 0.5, 1.0]], dtype=torch.float64)
     right = torch.tensor([[0.1, 0.5, 1.0]], dtype=torch.float64)

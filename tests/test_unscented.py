@@ -71,14 +71,12 @@ def test_exact_for_affine_maps(points, seed):
     torch.testing.assert_close(full(got_cov, 3), matrix @ root @ root.mT @ matrix.T, rtol=1e-8, atol=1e-8)
 
 
-def test_the_variance_of_a_sum_of_squares_is_right(dtype):
-    def chi_square(x):
-        return x.square().sum(-1, keepdim=True)
-
-    mean, variance, _ = unscented_transform(
-        chi_square, torch.zeros(4, dtype=dtype), torch.eye(4, dtype=dtype), SigmaPoints()
-    )
-    assert (mean.item(), variance.item()) == (pytest.approx(4, rel=1e-6), pytest.approx(8, rel=1e-6))
+@pytest.mark.parametrize("points", [SigmaPoints(), SigmaPoints(3, kappa=0.0), SigmaPoints(1, kappa=2.0)], ids=str)
+def test_the_variance_of_a_sum_of_squares_is_right(points, dtype):
+    n = points.dimensions
+    zero, one = torch.zeros(n, dtype=dtype), torch.eye(n, dtype=dtype)
+    mean, variance, _ = unscented_transform(lambda x: x.square().sum(-1, keepdim=True), zero, one, points)
+    assert (mean.item(), variance.item()) == (pytest.approx(n, rel=1e-6), pytest.approx(2 * n, rel=1e-6))
 
 
 @pytest.mark.parametrize("points", [*CHOICES, SigmaPoints(3, kappa=0.0), SigmaPoints(2, 1.0, 0.0, -1.0)], ids=str)
@@ -116,7 +114,7 @@ def test_errors_name_the_setting():
         SigmaPoints(4, kappa=-4)
     with pytest.raises(SettingError, match=r"sigma_points.alpha = 0"):
         SigmaPoints(alpha=0)
-    with pytest.raises(SettingError, match=r"sigma_points.beta = 0.0: expected at least 0.875"):
+    with pytest.raises(SettingError, match=r"sigma_points.beta = 0.0: expected more than 0.875"):
         SigmaPoints(4, 1.0, 0.0, -3.5)
     for name in ("alpha", "beta", "kappa"):
         with pytest.raises(SettingError, match=f"sigma_points.{name} = nan"):

@@ -54,8 +54,9 @@ def upper_confidence_bound(mean: Tensor, std: Tensor, alpha: float | Tensor) -> 
         (..., N). Differentiable in all three; the gradient with respect to an infinite alpha is 0.
 
     Raises:
-        SettingError: a number alpha that is negative or NaN.
+        SettingError: a number alpha that is negative or NaN, and shapes that do not belong together.
     """
+    _of_one_shape(mean, std, alpha, "acquisition.alpha")
     if not isinstance(alpha, Tensor):
         require(alpha >= 0, "acquisition.alpha", alpha, "a number of at least 0, or inf")
         return torch.broadcast_tensors(std, mean)[0] if math.isinf(alpha) else mean + alpha * std
@@ -145,8 +146,9 @@ def thompson(mean: Tensor, std: Tensor, generator: Generators) -> Tensor:
         (..., N). Differentiable in mean and std (reparametrized).
 
     Raises:
-        SettingError: the number of generators is not the number of rows.
+        SettingError: the number of generators is not the number of rows, and shapes that do not belong together.
     """
+    _of_one_shape(mean, std)
     return mean + std * draw(torch.randn, mean.shape, mean, generator)
 
 
@@ -155,12 +157,32 @@ def _normal_cdf(z: Tensor) -> Tensor:
     return 0.5 * torch.erfc(-math.sqrt(0.5) * z)
 
 
+def _of_one_shape(mean: Tensor, std: Tensor, row: float | Tensor = 0.0, name: str = "incumbent") -> None:
+    """Refuse what would broadcast to another shape than the mean's: (4, 1) with (4,) makes 16 numbers of 4."""
+    shapes = tuple(std.shape), tuple(mean.shape)
+    require(std.dim() in (0, mean.dim()) and _fits(std, mean), "std.shape", shapes[0], f"{shapes[1]}, as the mean")
+    if isinstance(row, Tensor):
+        rows = shapes[1][:-1]
+        fits = row.dim() < max(1, mean.dim()) and _fits(row[..., None], mean)
+        require(fits, f"{name}.shape", tuple(row.shape), f"{rows}, one for each row, or a number")
+
+
+def _fits(part: Tensor, whole: Tensor) -> bool:
+    pairs = zip(part.shape[::-1], whole.shape[::-1], strict=False)
+    return all(a == b or 1 in (a, b) for a, b in pairs)
+
+
 def _standardised(mean: Tensor, std: Tensor, incumbent: float | Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return z = difference/σ, the difference and σ; σ is floored only so far that z² and gradients stay finite."""
+    """Return z = difference/σ, the difference and σ; σ is floored only so far that z² and gradients stay finite.
+
+    The steepest is the logarithm's gradient in σ, difference²/σ³.
+    """
+    _of_one_shape(mean, std, incumbent)
     if isinstance(incumbent, Tensor):
         incumbent = incumbent.to(mean)[..., None]
-    difference = mean - incumbent
-    std = std.clamp_min(torch.finfo(mean.dtype).tiny ** 0.25)
+    difference, kind = mean - incumbent, torch.finfo(mean.dtype)
+    least = difference.detach().abs().pow(2 / 3) * (1000 / kind.max) ** (1 / 3)
+    std = torch.maximum(std, least.clamp_min(kind.tiny**0.5))
     return difference / std, difference, std
 
 
@@ -219,7 +241,7 @@ def known_well_enough(mean: Tensor, std: Tensor, eligible: Tensor, tolerance: fl
     valid = eligible & ~mean.isnan()
     best = torch.where(valid, mean, -torch.inf).argmax(-1, keepdim=True)
     others = valid & (torch.arange(mean.shape[-1], device=mean.device) != best)
-    spread = torch.sqrt(std.square() + std.gather(-1, best).square()).clamp_min(torch.finfo(mean.dtype).tiny ** 0.25)
+    spread = torch.hypot(std, std.gather(-1, best)).clamp_min(torch.finfo(mean.dtype).tiny)
     beaten = _normal_cdf((mean - mean.gather(-1, best) - tolerance) / spread)
     return (torch.where(others, beaten, 0.0).sum(-1) < probability) & valid.any(-1)
 

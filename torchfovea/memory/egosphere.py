@@ -84,10 +84,10 @@ class Prior:
     slope_std: float = 1.5
 
     def __post_init__(self) -> None:
-        """Raise SettingError unless all are positive."""
+        """Raise SettingError unless all are positive, of a size whose square, and its inverse, float32 can hold."""
         for name in ("mean", "std", "bearing_std", "slope_std"):
             value = getattr(self, name)
-            require(0 < value < math.inf, f"prior.{name}", value, "a positive number")
+            require(1e-9 <= value <= 1e9, f"prior.{name}", value, "a positive number, 1e-9 to 1e9")
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,8 @@ class Fusion:
         names = ("inverse_range", "aligned", "printed")
         require(self.name in names, "fusion", self.name, "one of " + ", ".join(names))
         for name in ("gate_deg", "gate_spacing"):
-            require(0 <= getattr(self, name) < math.inf, f"fusion.{name}", getattr(self, name), "at least 0")
+            require(0 <= getattr(self, name) <= 1e6, f"fusion.{name}", getattr(self, name), "0 to 1e6")
+        require(isinstance(self.fill, bool), "fusion.fill", self.fill, "true or false")
         require(self.conflict > 0, "fusion.conflict", self.conflict, "a positive number of standard deviations")
         require(0 <= self.erode <= 1, "fusion.erode", self.erode, "a share from 0 to 1")
         require(self.half_life > 0, "fusion.half_life", self.half_life, "a positive number of saccades")
@@ -156,10 +157,11 @@ def new_egosphere(cells: Tensor, prior: Prior, chart: str = "inverse_range") -> 
         chart: of the information, see `Fusion.chart`.
 
     Raises:
-        SettingError: for no cells or directions that are not unit vectors.
+        SettingError: for no cells, directions that are not unit vectors, or an unknown chart.
 
     Differentiable in the cells.
     """
+    require(chart in ("inverse_range", "cartesian"), "chart", chart, "inverse_range or cartesian")
     require(cells.dim() >= 2 and cells.shape[-1] == 3, "cells", tuple(cells.shape), "a shape (..., cells, 3)")
     require(cells.numel() > 0, "memory.cells", cells.shape[-2], "at least 1")
     unit = bool(((cells * cells).sum(-1) - 1).abs().max() < 1e-3)
@@ -244,8 +246,12 @@ def remember(
         common: see `add_common`; a function of the points that the saccade found, see `torchfovea.memory.encoders`.
 
     Returns:
-        The ego-sphere after. Differentiable in the observations (the association is held fixed).
+        The ego-sphere after, in the dtype of the one before. Differentiable in the observations (the association is
+        held fixed).
     """
+    mean, cov, direction, support, valid, inlier = observed
+    mean, cov, direction, support = (part.to(memory.cells.dtype) for part in (mean, cov, direction, support))
+    observed = Observations(mean, cov, direction, support, valid, inlier)
     cells, batch, chart = memory.cells, memory.cells.shape[:-2], fusion.chart
     if fusion.half_life < math.inf:
         memory = forget(memory, prior, chart, 0.5 ** (1 / fusion.half_life))
@@ -263,7 +269,7 @@ def remember(
     if common is not None:
         if callable(common):
             common = common(found_points(pooled, cells, chart, prior.slope_std))
-        pooled = add_common(pooled, common, chart, prior.slope_std)
+        pooled = add_common(pooled, common.to(cells.dtype), chart, prior.slope_std)
     if chart == "inverse_range" and fusion.conflict < math.inf:
         memory, pooled = settle(memory, pooled, fusion, prior)
     return fuse(memory, pooled)

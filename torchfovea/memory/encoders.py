@@ -16,12 +16,14 @@ from torchfovea.setting import require
 
 __all__ = ["encoder_covariance", "encoder_jacobian"]
 
+_NEAREST_M = 1e-3
+
 
 def encoder_jacobian(points: Tensor, eyes: Eyes) -> tuple[Tensor, Tensor, Tensor]:
     """How triangulated points move with the pan, tilt and vergence that the head is believed to have.
 
     Args:
-        points: (..., N, 3) in E [m], not on the baseline's line.
+        points: (..., N, 3) in E [m]; on the baseline's line, where two rays have no crossing, vergence moves none.
         eyes: the believed poses (...).
 
     Returns:
@@ -36,12 +38,14 @@ def encoder_jacobian(points: Tensor, eyes: Eyes) -> tuple[Tensor, Tensor, Tensor
     # the left ray turns by +ε/2 about the optical y, the right one by −ε/2; where do they pass closest?
     turn_left, turn_right = torch.linalg.cross(down, left) / 2, -torch.linalg.cross(down, right) / 2
     normal = torch.linalg.cross(base, left)
-    normal = normal / (normal * normal).sum(-1, keepdim=True)
+    square = (normal * normal).sum(-1, keepdim=True)
+    crossing = square > torch.finfo(square.dtype).tiny ** 0.5
+    normal = normal / torch.where(crossing, square, torch.ones_like(square))
     miss = turn_left - turn_right
     s = -(torch.linalg.cross(miss, right) * normal).sum(-1, keepdim=True)
     t = -(torch.linalg.cross(miss, left) * normal).sum(-1, keepdim=True)
     vergence = (s * left + t * right + turn_left + turn_right) / 2
-    return pan, tilt, vergence
+    return pan, tilt, torch.where(crossing, vergence, torch.zeros_like(vergence))
 
 
 def encoder_covariance(
@@ -53,7 +57,8 @@ def encoder_covariance(
         points: where each cell's point is, (..., N, 3) in E [m].
         eyes: the believed poses (...).
         sigma_rad: standard deviations of pan, tilt and vergence.
-        chart: `cartesian`, or `inverse_range`: of (a, b, ρ) about the points' own directions.
+        chart: `cartesian`, or `inverse_range`: of (a, b, ρ) about the points' own directions, and for one within a
+            millimetre of E's origin, which has none, as for one that is a millimetre ahead.
 
     Returns:
         Packed (..., N, 6), for `torchfovea.memory.pooling.add_common`. Differentiable.
@@ -65,8 +70,11 @@ def encoder_covariance(
     require(chart in ("inverse_range", "cartesian"), "chart", chart, "inverse_range or cartesian")
     moves = [sigma * move for sigma, move in zip(sigma_rad, encoder_jacobian(points, eyes), strict=True)]
     if chart == "inverse_range":
-        rho = torch.linalg.vector_norm(points, dim=-1).reciprocal()
-        direction = points * rho[..., None]
+        square = (points * points).sum(-1)
+        apart = square > _NEAREST_M**2
+        rho = torch.where(apart, square, torch.full_like(square, _NEAREST_M**2)).rsqrt()
+        ahead = points.new_tensor([1.0, 0.0, 0.0])
+        direction = torch.where(apart[..., None], points * rho[..., None], ahead)
         axes = (*basis(direction), direction)
         scale = (rho, rho, -rho * rho)
         moves = [columns(*(k * (m * a).sum(-1) for k, a in zip(scale, axes, strict=True))) for m in moves]

@@ -34,8 +34,8 @@ class Pinhole:
     cy_px: float = 0.0
 
     def __post_init__(self) -> None:
-        """Raise SettingError unless the focal length is positive and finite."""
-        require(0 < self.focal_px < math.inf, "focal_px", self.focal_px, "a positive number of pixels")
+        """Raise SettingError unless the focal length is positive and all is finite."""
+        _require_numbers(self)
 
     @staticmethod
     def from_fov(fov_deg: float, radius_px: float) -> Pinhole:
@@ -86,8 +86,8 @@ class Fisheye:
     cy_px: float = 0.0
 
     def __post_init__(self) -> None:
-        """Raise SettingError unless the focal length is positive and finite."""
-        require(0 < self.focal_px < math.inf, "focal_px", self.focal_px, "a positive number of pixels")
+        """Raise SettingError unless the focal length is positive and all is finite."""
+        _require_numbers(self)
 
     @staticmethod
     def from_fov(fov_deg: float, radius_px: float) -> Fisheye:
@@ -127,6 +127,12 @@ class Fisheye:
 
 
 Camera = Pinhole | Fisheye
+
+
+def _require_numbers(camera: Camera) -> None:
+    require(0 < camera.focal_px < math.inf, "focal_px", camera.focal_px, "a positive number of pixels")
+    for name in ("cx_px", "cy_px"):
+        require(math.isfinite(getattr(camera, name)), name, getattr(camera, name), "a finite number of pixels")
 
 
 def image_camera(camera: Camera, radius_px: float, size_px: int) -> Camera:

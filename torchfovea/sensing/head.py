@@ -20,6 +20,9 @@ from torchfovea.setting import require
 __all__ = ["Eyes", "Gaze", "Head", "clamp_gaze", "cyclopean", "eyes", "fixate", "rig_frame", "to_ego"]
 
 
+_FARTHEST_M = 1e12
+
+
 class Gaze(NamedTuple):
     """Where the head looks; all [rad], any common shape (...).
 
@@ -78,7 +81,8 @@ class Head:
 
     def __post_init__(self) -> None:
         """Raise SettingError for a head that cannot exist."""
-        require(self.baseline_m > 0, "head.baseline_m", self.baseline_m, "a positive distance in metres")
+        positive = 0 < self.baseline_m < math.inf
+        require(positive, "head.baseline_m", self.baseline_m, "a positive distance in metres")
         require(0 < self.pan_limit_deg < 180, "head.pan_limit_deg", self.pan_limit_deg, "between 0 and 180 degrees")
         for name in ("tilt_up_deg", "tilt_down_deg"):
             require(
@@ -107,8 +111,13 @@ def cyclopean(head: Head, gaze: Gaze) -> tuple[Tensor, Tensor]:
         R (..., 3, 3), whose columns are C's x (right), y (down) and z (forward) axes in E, and its origin
         t (..., 3) [m].
 
+    Raises:
+        SettingError: for angles of several dtypes, or of whole numbers.
+
     Differentiable in the gaze.
     """
+    kinds = {str(angle.dtype) for angle in gaze}
+    require(len(kinds) == 1 and gaze.pan.is_floating_point(), "gaze.dtype", sorted(kinds), "one floating-point dtype")
     cp, sp = torch.cos(gaze.pan), torch.sin(gaze.pan)
     ct, st = torch.cos(gaze.tilt), torch.sin(gaze.tilt)
     zero = torch.zeros_like(cp)
@@ -156,10 +165,18 @@ def fixate(head: Head, point: Tensor) -> tuple[Gaze, Tensor]:
         The gaze, clamped to the limits (so always one that the head can take), and whether it does meet the point:
         bool (...). A point behind, too near, out of limits or not finite is unreachable, never NaN.
 
+    Raises:
+        SettingError: for a point of another shape, or of whole numbers.
+
     Differentiable in the point where it is reachable; zero gradient where it is not.
     """
+    good = point.dim() >= 1 and point.shape[-1] == 3 and point.is_floating_point()
+    require(good, "point", f"{tuple(point.shape)} {point.dtype}", "a floating-point tensor (..., 3)")
     finite = torch.isfinite(point).all(-1)
-    x, y, z = torch.where(finite[..., None], point, torch.ones_like(point)).unbind(-1)
+    point = torch.where(finite[..., None], point, torch.ones_like(point))
+    largest = point.detach().abs().amax(-1, keepdim=True)
+    # all angles are there long before squares overflow
+    x, y, z = (point * (_FARTHEST_M / largest.clamp(min=_FARTHEST_M))).unbind(-1)
     side = x * x + y * y
     up, forward = head.eyes_up_m, head.eyes_forward_m
     # in the neck's vertical plane the point is at (d + forward, up): |X|² = (d + forward)² + up²
@@ -182,8 +199,9 @@ def fixate(head: Head, point: Tensor) -> tuple[Gaze, Tensor]:
         tilt.clamp(up_limit, down_limit),
         vergence.clamp(max=math.radians(head.vergence_max_deg)),
     )
-    ahead_only = [torch.where(solvable, angle, torch.zeros_like(angle)) for angle in gaze]
-    return Gaze(*ahead_only), solvable & within
+    reachable = solvable & within
+    held = (torch.where(reachable, angle, angle.detach()) for angle in gaze)
+    return Gaze(*(torch.where(solvable, angle, torch.zeros_like(angle)) for angle in held)), reachable
 
 
 def clamp_gaze(head: Head, gaze: Gaze) -> Gaze:

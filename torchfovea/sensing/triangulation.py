@@ -75,7 +75,7 @@ def triangulate(left: Tensor, right: Tensor, t_left: Tensor, t_right: Tensor) ->
 
     Returns:
         Points (..., 3) [m] and whether they lie in front of both eyes, bool (...). Where they do not (parallel rays
-        included) the point is finite and meaningless.
+        included, as far as their dtype can tell) the point is finite and meaningless.
 
     Differentiable where in front; zero gradient elsewhere.
 
@@ -83,10 +83,13 @@ def triangulate(left: Tensor, right: Tensor, t_left: Tensor, t_right: Tensor) ->
         Wang, Liu (2007), for the midpoint method.
     """
     baseline = t_right - t_left
+    # by their largest components, so that products keep within the dtype's range
+    sizes = (d.detach().abs().amax(-1, keepdim=True) for d in (left, right))
+    left, right = (d / torch.where(n > 0, n, torch.ones_like(n)) for d, n in zip((left, right), sizes, strict=True))
     c = _cross(left, right)
     square = (c * c).sum(-1)
     s, t = (_cross(baseline, right) * c).sum(-1), (_cross(baseline, left) * c).sum(-1)
-    in_front = (s > 0) & (t > 0) & (square > 0)
+    in_front = (s > 0) & (t > 0) & (square > torch.finfo(square.dtype).eps ** 2)
     inverse = 1 / torch.where(in_front, square, torch.ones_like(square))
     point = (t_left + t_right + (s * inverse)[..., None] * left + (t * inverse)[..., None] * right) / 2
     return torch.where(in_front[..., None], point, torch.ones_like(point)), in_front
@@ -95,13 +98,13 @@ def triangulate(left: Tensor, right: Tensor, t_left: Tensor, t_right: Tensor) ->
 def triangulate_rectified(left: Tensor, right: Tensor, baseline_m: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The point between two rays in the rig's own frame, in homogeneous form: depth from horizontal disparity alone.
 
-    With the eyes at ∓b/2 on the x axis, rays (x, y, z) and (x', y', z'):
+    With the eyes at ∓b/2 on the x axis and rays (x, y, z), (x', y', z') it is X/w, with w = x z' − x' z and
 
-        X = b/2 (x z' + x' z, y z' + y' z, 2 z z'),   w = x z' − x' z.
+        X = b/2 (x z' + x' z, y z' + y' z, 2 z z').
 
     It is `triangulate` where the rays meet. Where noise keeps them apart it leaves the vertical mismatch out of it
-    (which is what the likelihood of isotropic noise on a rectified pair says), and numerator and denominator keep their
-    signs through parallel rays, where the shortest segment between skew rays would jump toward the eyes.
+    (as the likelihood of isotropic noise on a rectified pair does), and X and w keep their signs through parallel rays,
+    where the shortest segment between skew rays would jump toward the eyes.
 
     Args:
         left: directions (..., 3) of any length, x along the baseline from left to right, z ahead.
@@ -214,12 +217,10 @@ def _safe(
     """Ordinary values in place of those that will not be valid, whose gradients might not be finite even times 0."""
     with torch.no_grad():
         keep = _settled(matches, *transform(matches))[2]
-    if bool(keep.all()):
-        return matches
     ahead = [matches.left_px.new_tensor([camera.cx_px, camera.cy_px]) for camera in cameras]
-    places = (torch.where(keep[..., None], px, a) for px, a in zip(matches[:2], ahead, strict=True))
-    sigmas = (torch.where(keep, sigma, torch.ones_like(sigma)) for sigma in matches[2:4])
-    return Correspondences(*places, *sigmas, keep, matches.inlier)
+    left, right = (torch.where(keep[..., None], px, a) for px, a in zip(matches[:2], ahead, strict=True))
+    sigma_l, sigma_r = (torch.where(keep, sigma, torch.ones_like(sigma)) for sigma in matches[2:4])
+    return Correspondences(left, right, sigma_l, sigma_r, keep, matches.inlier)
 
 
 # of the images of the sigma points: mean and covariance by components, the direction of the central one (3, ..., N),
@@ -304,11 +305,8 @@ def _transform_form(matches: Correspondences, form: _Form, points: SigmaPoints, 
 def _settled(
     matches: Correspondences, first: list[Tensor], second: list[Tensor], direction: Tensor, ahead: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean and covariance (9, ..., N), of unit size where not valid; the direction; and what is valid.
-
-    One number is positive where all conditions hold, and not a number where anything is not finite: comparing once is
-    faster than joining bools.
-    """
+    """Mean and covariance (9, ..., N), of unit size where not valid; the direction; and what is valid."""
+    # positive where all conditions hold, not a number where anything is not finite: comparing once is faster
     with torch.no_grad():
         sure = torch.minimum(matches.left_sigma_px, matches.right_sigma_px)
         keep = torch.minimum(torch.minimum(ahead, sure), definiteness(second))

@@ -37,10 +37,10 @@ class SigmaPoints:
     The default puts them at ±√3 standard deviations with equal weights for mean and covariance. Along each axis of the
     square root that is three-point Gauss-Hermite quadrature, exact to fifth order. The paper's choice is `paper()`.
 
-    With a negative weight of the centre, Eq. 18 may give a negative variance: −4 for the default and |x|² of four
-    standard normals, where 8 is right. Where that can happen (`by_axis`) the covariances of the one-dimensional
-    quadratures add up instead, as they do for a function that is a sum over the axes; for such it is exact as far as
-    they are. Where only one axis is curved, both are the same.
+    With a negative weight of the centre, Eq. 18 may give a negative variance, or none: −4 for the default and |x|² of
+    four standard normals, where 8 is right. Where that can happen (`by_axis`) the covariances of the quadratures along
+    the axes add up instead, as they do for a function that is a sum over the axes. Where only one axis is curved, both
+    are the same.
 
     Attributes:
         dimensions: n, of the input.
@@ -70,8 +70,8 @@ class SigmaPoints:
             not self.by_axis or self.spread >= 1,
             "sigma_points.beta",
             self.beta,
-            f"at least {-(self.alpha**2) * self.kappa / self.dimensions:g}, or points at a standard deviation or more: "
-            "otherwise variances may be negative",
+            f"more than {-(self.alpha**2) * self.kappa / self.dimensions:g}, or points at a standard deviation or "
+            "more: otherwise variances may be negative",
         )
 
     @staticmethod
@@ -96,11 +96,11 @@ class SigmaPoints:
 
     @property
     def by_axis(self) -> bool:
-        """Whether Eq. 18 may give a negative variance, so that variances are those along each axis, added up.
+        """Whether Eq. 18 may give a negative variance, or none, so that variances are those along each axis, added up.
 
         Σ w_c (δ − s)(δ − s)ᵀ = w Σ δδᵀ + (β − α²) s sᵀ with s = w Σ δ, and s sᵀ is at most n/spread² of the first term.
         """
-        return self.beta < -(self.alpha**2) * self.kappa / self.dimensions
+        return self.beta <= -(self.alpha**2) * self.kappa / self.dimensions
 
     @cached_property
     def weights(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
