@@ -1,5 +1,7 @@
 """Cameras: projection and rays undo each other, against OpenCV."""
 
+import math
+
 import cv2
 import numpy as np
 import pytest
