@@ -298,6 +298,22 @@ def test_planes_that_nobody_matches_leave_empty_cells(tmp_path):
     json.loads((tmp_path / "run" / "result.json").read_text(), parse_constant=pytest.fail)
 
 
+def test_planes_are_matched_by_the_matcher_that_is_asked(tmp_path, capsys, monkeypatch):
+    few = ("propagation.run=false", "realised.source_px=[100]")
+    (tmp_path / "blind.py").write_text(
+        "import numpy as np\ndef see(left, right): return np.full(left.shape[:2], np.nan)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    shares = {}
+    for matcher in ("sgbm", "sweep", "external"):
+        source = ("matcher.source=blind:see",) if matcher == "external" else ()
+        assert characterize(tmp_path / matcher, *few, f"matcher={matcher}", *source) == 0, capsys.readouterr().err
+        with (tmp_path / matcher / "run" / "realised.csv").open() as file:
+            shares[matcher] = [float(row["matched_fraction"]) for row in csv.DictReader(file)]
+    assert not any(shares["external"])
+    assert max(shares["sgbm"]) > 0.5 and max(shares["sweep"]) > 0.5 and shares["sgbm"] != shares["sweep"]
+
+
 @pytest.mark.parametrize(
     "override, line",
     [

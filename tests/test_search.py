@@ -103,6 +103,9 @@ def test_same_seed_same_run_and_explicit_settings_beat_the_profile(folder, capsy
         (["scene=cans", "scene.cans=1"], "scene.cans = 1"),
         (["sensor.nothing=1"], "sensor.nothing = 1: expected a known setting"),
         (["seed=-1"], "seed = -1"),
+        (["device=cudaa"], "device = cudaa: expected one of cpu, cuda"),
+        (["picture=nan"], "picture = nan: expected true or false"),
+        (["stop.probability=0.1", "stop.tolerance=text"], "stop.tolerance = text"),
     ],
 )
 def test_a_mistake_is_one_line_and_leaves_nothing(folder, capsys, overrides, line):
@@ -111,3 +114,26 @@ def test_a_mistake_is_one_line_and_leaves_nothing(folder, capsys, overrides, lin
     assert printed.err.startswith("torchfovea search: ") and len(printed.err.splitlines()) == 1, printed.err
     assert line in printed.err
     assert not list(folder.rglob("result.json")) and not list(folder.rglob("*.csv"))
+
+
+def test_a_device_that_will_not_be_used_is_refused(folder, capsys, monkeypatch):
+    """Photometric episodes and moving heads run on the CPU alone; also where a GPU is there."""
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    for overrides in (["fidelity=photometric"], ["fidelity=geometric", "motor=physics"]):
+        assert main(["search", *SMALL, *overrides, "device=cuda"]) == 1
+        assert "device = cuda: expected cpu, or fidelity=geometric motor=instant" in capsys.readouterr().err
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    assert main(["search", *SMALL, "fidelity=geometric", "device=cuda"]) == 1
+    assert "device = cuda: expected cpu, or cuda on a machine that has it" in capsys.readouterr().err
+
+
+def test_encoder_noise_is_that_of_the_seed_whatever_the_batch(folder, capsys):
+    common = ["fidelity=geometric", "episodes=3", "head.encoder_deg=0.5", "picture=false"]
+    courses = []
+    for batch in (1, 2, 3):
+        run, _ = search(capsys, *common, f"batch={batch}")
+        courses.append((run / "saccades.csv").read_text())
+    assert courses[0] == courses[1] == courses[2]
+    second, _ = search(capsys, *common, "episodes=1", "seed=1")
+    rows = [line.partition(",")[2] for line in courses[0].splitlines() if line.startswith("1,")]
+    assert rows == [line.partition(",")[2] for line in (second / "saccades.csv").read_text().splitlines()[1:]]

@@ -8,7 +8,7 @@ import torch
 from torchfovea.arena import Together
 from torchfovea.perception import Observer
 from torchfovea.sensing.camera import Pinhole
-from torchfovea.sensing.head import Gaze, eyes, to_ego
+from torchfovea.sensing.head import Gaze, Head, eyes, to_ego
 from torchfovea.sensing.layout import LogPolar, Uniform
 from torchfovea.setting import SettingError
 from torchfovea.sim.arena import Arena, draw_fields
@@ -124,3 +124,23 @@ def test_drawn_receptive_fields():
         assert len(chosen) == 4 and bool((chosen.diff() > 0).all())
         counts[chosen] += 1
     assert bool(((counts / 400 - 0.4).abs() < 0.1).all())
+
+
+def test_heads_err_independently(scenes, gaze):
+    """Rows with other seeds have other encoder errors, each its own whoever is beside it."""
+    observer = Observer(head=Head(encoder_deg=1.0))
+
+    def errors(seeds):
+        rows = slice(0, len(seeds))
+        arenas = GeometricArenas(scenes[rows], observer, seeds=seeds)
+        asked = Gaze(*(angle[rows] for angle in gaze))
+        told = [torch.stack(list(arenas.saccade(asked).gaze), -1) for _ in range(2)]
+        return torch.stack([t - torch.stack(list(asked), -1) for t in told])
+
+    together, pair, alone = errors([4, 7, 4]), errors([4, 7]), errors([7])
+    torch.testing.assert_close(together[:, 2], together[:, 0])
+    torch.testing.assert_close(pair[:, 1], together[:, 1])
+    assert bool(((together[:, 0] - together[:, 1]).abs() > 1e-6).all())
+    assert bool(((alone[0] - alone[1]).abs() > 1e-6).all())
+    with pytest.raises(SettingError, match="seeds = 1"):
+        GeometricArenas(scenes, observer, seeds=[1])

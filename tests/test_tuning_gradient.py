@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -11,6 +12,7 @@ from omegaconf import OmegaConf
 
 from torchfovea.cli import main
 from torchfovea.experiments.build import build_cells
+from torchfovea.memory.egosphere import Prior
 from torchfovea.memory.sphere import direction_mixture, log_density, log_normalizer, sphere_quadrature
 from torchfovea.perception import Observer
 from torchfovea.sensing.camera import Pinhole
@@ -242,7 +244,7 @@ def test_the_field_of_view_is_tuned_by_common_random_numbers(alpha):
         Task(Observer(camera=Pinhole.from_fov(100.0, 100.0)), 5), p.distribution, Shape(tune_alpha=alpha), 30
     )
     batch = p.batch(64, stream("training", 0))
-    assert torch.equal(play(p, wide, batch).value, play(plain, wide[:-1], batch).value)
+    torch.testing.assert_close(play(p, wide, batch).value, play(plain, wide[:-1], batch).value)
     found = gradient(p, "coverage", x, batch, 0.5)
     assert found.vector[-1] > 0 and found.episodes == 64 + 64 * (1 + alpha)
     best = train(p, x, Schedule(160, scenes=4, warm_episodes=0, validations=2, validation_scenes=32)).vector
@@ -295,6 +297,16 @@ def test_training_gains_resumes_and_never_ends_below_its_start(tmp_path):
     assert again.history == whole.history and again.episodes == whole.episodes
     with pytest.raises(SettingError, match="checkpoint schedule"):
         train(p, start, Schedule(episodes=161), tmp_path / "part.pt")
+    task, seer = p.task, p.task.observer
+    narrow = replace(seer, camera=Pinhole.from_fov(60.0, 100.0))
+    for name, other in {
+        "saccades": task._replace(saccades=3), "far_m": task._replace(far_m=3.0),
+        "metric": task._replace(metric="gap_final"), "camera": task._replace(observer=narrow),
+        "head": task._replace(observer=replace(seer, head=Head(baseline_m=0.1))),
+        "prior": task._replace(observer=replace(seer, prior=Prior(std=0.3))),
+    }.items():  # fmt: skip
+        with pytest.raises(SettingError, match=f"checkpoint {name} = "):
+            train(Problem(other, p.distribution, p.shape, p.cells), start, schedule, tmp_path / "part.pt")
     (tmp_path / "bad.pt").write_bytes(b"no checkpoint")
     with pytest.raises(SettingError, match=r"bad\.pt"):
         train(p, start, schedule, tmp_path / "bad.pt")

@@ -24,6 +24,7 @@ class Command(NamedTuple):
     target: str
     summary: str
     example: str
+    resumes: bool = False
 
 
 # A command NAME is a function of its composed configuration conf/NAME.yaml; what it returns is the score that
@@ -33,6 +34,7 @@ COMMANDS: dict[str, Command] = {
         "torchfovea.experiments.search:run",
         "find the nearest object by saccades, and map the scene: the main job",
         "torchfovea search scene=cans sensor=uniform acquisition.alpha=2",
+        resumes=True,
     ),
     "sense": Command(
         "torchfovea.experiments.sense:run",
@@ -43,16 +45,19 @@ COMMANDS: dict[str, Command] = {
         "torchfovea.experiments.characterize:run",
         "what two eyes know of planes, foveal and uniform (Fig. 5), and how far to believe it",
         "torchfovea characterize profile=quick",
+        resumes=True,
     ),
     "tune": Command(
         "torchfovea.experiments.tune:run",
         "learn the memory's bias and alpha by gradient on simulated episodes",
         "torchfovea tune profile=quick distribution=left_below",
+        resumes=True,
     ),
     "reproduce": Command(
         "torchfovea.experiments.reproduce:run",
         "the paper's figures and claims, measured again, with intervals and verdicts",
         "torchfovea reproduce profile=quick",
+        resumes=True,
     ),
     "collect": Command(
         "torchfovea.experiments.collect:run",
@@ -200,12 +205,18 @@ def _job(command: str, overrides: list[str], full_error: bool) -> Callable[[Any]
         from omegaconf import OmegaConf
 
         from torchfovea.config import run_folder
+        from torchfovea.experiments.manifest import MANIFEST, record, unclaimed, withdraw
         from torchfovea.mistakes import describe
 
         folder = run_folder()
         settings = HydraConfig.get().job
         sweeping = not OmegaConf.is_missing(settings, "num")
         try:
+            if not COMMANDS[command].resumes:
+                unclaimed(folder)
+            taken = COMMANDS[command].resumes and (folder / "result.json").exists()
+            if not (taken or (folder / MANIFEST).exists()):
+                record(cfg, folder)
             module, _, function = COMMANDS[command].target.partition(":")
             score = getattr(importlib.import_module(module), function)(cfg)
         except Exception as error:
@@ -216,6 +227,8 @@ def _job(command: str, overrides: list[str], full_error: bool) -> Callable[[Any]
             if line is None:
                 traceback.print_exc()
                 line = f"{type(error).__name__}: {error}"
+            else:
+                withdraw(folder)
             if sweeping:
                 # Hydra goes on with the other jobs, and raises this at the end.
                 what = settings.override_dirname

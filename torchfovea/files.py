@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-__all__ = ["replacing", "write_csv", "write_figure", "write_json", "write_result"]
+__all__ = ["create_json", "replacing", "write_csv", "write_figure", "write_json", "write_result"]
 
 
 @contextmanager
@@ -35,14 +35,18 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     temporary = Path(name)
     try:
         yield temporary
-        # mkstemp makes files that only their owner can read; give the rights any new file would have here.
-        mask = os.umask(0)
-        os.umask(mask)
-        temporary.chmod(0o666 & ~mask)
+        _open_to_others(temporary)
         os.replace(temporary, path)
     finally:
         with suppress(FileNotFoundError):
             temporary.unlink()
+
+
+def _open_to_others(path: Path) -> None:
+    """Mkstemp makes files that only their owner can read; give the rights any new file would have here."""
+    mask = os.umask(0)
+    os.umask(mask)
+    path.chmod(0o666 & ~mask)
 
 
 def _plain(value: Any) -> Any:
@@ -70,9 +74,37 @@ def write_json(path: str | os.PathLike[str], content: Any) -> None:
     Raises:
         TypeError: for content that JSON has no form for; nothing is written then.
     """
-    text = json.dumps(_plain(content), indent=2, allow_nan=False, ensure_ascii=False)
     with replacing(path) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
+        temporary.write_text(_json(content), encoding="utf-8")
+
+
+def create_json(path: str | os.PathLike[str], content: Any) -> bool:
+    """Write JSON unless the file exists; of several that try at once, one does.
+
+    Args:
+        path: the file, which then appears whole.
+        content: as `write_json`.
+
+    Returns:
+        Whether it was written.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(_json(content))
+        _open_to_others(Path(name))
+        os.link(name, path)
+    except FileExistsError:
+        return False
+    finally:
+        os.unlink(name)
+    return True
+
+
+def _json(content: Any) -> str:
+    return json.dumps(_plain(content), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def write_result(folder: str | os.PathLike[str], figures: Mapping[str, Any]) -> None:

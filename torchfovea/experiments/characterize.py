@@ -17,9 +17,9 @@ from torch import Tensor
 from torchfovea.config import run_folder
 from torchfovea.experiments.build import build_sensor, construct, number, whole
 from torchfovea.experiments.honesty import CHUNK, plan_cases, plan_planes, propagate, realise, wholes
-from torchfovea.experiments.manifest import finished
+from torchfovea.experiments.manifest import complete, finished
 from torchfovea.experiments.progress import progress_bar
-from torchfovea.files import write_csv, write_result
+from torchfovea.files import write_csv
 from torchfovea.sensing.correspondence import Budget
 from torchfovea.sensing.layout import LogPolar, Uniform
 from torchfovea.setting import require
@@ -85,7 +85,7 @@ def run(cfg: DictConfig) -> float:
             figures |= realise(cfg, folder, full, tasks, done)
     _write_advantage(folder, distance, matched, advantage)
     _draw(folder, cfg, grids, layouts, printed["uniform"])
-    write_result(folder, figures)
+    complete(folder, figures)
     _print(figures)
     return float(figures["foveal_advantage_min_nats"] or 0.0)
 

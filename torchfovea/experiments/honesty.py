@@ -12,11 +12,10 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from torchfovea.experiments.build import construct, whole
+from torchfovea.experiments.build import build_matcher, whole
 from torchfovea.files import write_csv
 from torchfovea.sensing.unscented import SigmaPoints
 from torchfovea.setting import require
-from torchfovea.stereo.sgbm import SGBM
 from torchfovea.studies.characterization import PlaneSensor, matched_vergence
 from torchfovea.studies.propagation import (
     StereoCases,
@@ -143,7 +142,7 @@ def realise(
     from torchfovea.pictures.sensor import draw_realised
 
     matcher, planes, seed = (
-        construct(SGBM, cfg.matcher, "matcher"),
+        build_matcher(cfg),
         whole(cfg, "realised.planes"),
         whole(cfg, "seed", 0),
     )

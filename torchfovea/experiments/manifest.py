@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from torchfovea.files import write_json
-from torchfovea.setting import SettingError
+from torchfovea.files import create_json, replacing, write_json, write_result
+from torchfovea.setting import SettingError, require
 
-__all__ = ["MANIFEST", "config_hash", "finished", "read_result"]
+__all__ = ["MANIFEST", "complete", "config_hash", "finished", "read_result", "record", "unclaimed", "withdraw"]
 
 MANIFEST = "manifest.json"
 # what does not change a run's figures
@@ -44,31 +45,80 @@ def read_result(path: Path) -> dict[str, Any]:
 
 
 def finished(cfg: DictConfig, folder: Path, score: str = "gap_per_saccade") -> float | None:
-    """The score of a run that is already complete in its folder; else leave a manifest there and return None.
+    """The score of a run that is already complete in its folder; else claim the folder by a manifest and return None.
+
+    Of two runs that begin in one folder at the same moment only one makes the manifest; the other reads it.
 
     Raises:
         SettingError: the folder was made with other settings, or its result is corrupt; nothing is touched then.
     """
     made_with = config_hash(cfg)
     manifest, result = folder / MANIFEST, folder / "result.json"
-    if manifest.exists():
-        try:
-            before = json.loads(manifest.read_text(encoding="utf-8"))["config_hash"]
-        except (ValueError, KeyError, TypeError) as error:
-            raise SettingError(
-                f"{manifest}: {error}: expected a run's manifest; remove the folder to run again"
-            ) from None
-        if before != made_with:
-            raise SettingError(
-                f"{folder} = made with other settings ({before}, now {made_with}): expected the same settings, "
-                "another folder, or none"
-            )
-    elif result.exists():
-        raise SettingError(f"{result} = made without a manifest: expected another folder, or none")
-    if result.exists():
-        value = read_result(result).get(score)
-        return float("nan") if value is None else float(value)
-    overrides = list(HydraConfig.get().overrides.task) if HydraConfig.initialized() else []
-    settings = OmegaConf.to_container(cfg, resolve=True)
-    write_json(manifest, {"config_hash": made_with, "overrides": overrides, "settings": settings})
-    return None
+    if not manifest.exists():
+        if result.exists():
+            raise SettingError(f"{result} = made without a manifest: expected another folder, or none")
+        overrides = list(HydraConfig.get().overrides.task) if HydraConfig.initialized() else []
+        settings = OmegaConf.to_container(cfg, resolve=True)
+        if create_json(manifest, {"config_hash": made_with, "overrides": overrides, "settings": settings}):
+            return None
+    before = _read_manifest(manifest)
+    if before["config_hash"] != made_with:
+        raise SettingError(
+            f"{folder} = made with other settings ({before['config_hash']}, now {made_with}): expected the same "
+            "settings, another folder, or none"
+        )
+    if not result.exists():
+        return None
+    figures = read_result(result)
+    value = figures.get(score)
+    whole = score in figures and (value is None or isinstance(value, int | float))
+    require(whole, f"{result}: {score}", value, "a number; remove the file to run again")
+    for name, size in before.get("tables", {}).items():
+        table = folder / name
+        found = table.stat().st_size if table.is_file() else 0
+        require(
+            found == size, str(table), f"{found} bytes", f"the {size} that were written; remove {result} to run again"
+        )
+    return float("nan") if value is None else float(value)
+
+
+def complete(folder: Path, figures: Mapping[str, Any]) -> None:
+    """Write result.json, which says that a run is complete; before it, the sizes of its tables, into the manifest."""
+    tables = {path.name: path.stat().st_size for path in sorted(folder.glob("*.csv"))}
+    write_json(folder / MANIFEST, {**_read_manifest(folder / MANIFEST), "tables": tables})
+    write_result(folder, figures)
+
+
+def unclaimed(folder: Path) -> None:
+    """Refuse the folder of a run that resumes, for a command that does not: its tables and result would be mixed.
+
+    Raises:
+        SettingError: for a folder with a manifest.
+    """
+    claimed = (folder / MANIFEST).exists()
+    require(not claimed, str(folder), "the folder of a run that resumes", "another folder, or none")
+
+
+def withdraw(folder: Path) -> None:
+    """Take back the claim of a run that failed by a mistake in its settings before it wrote anything."""
+    if all(entry.name in (MANIFEST, ".hydra") or entry.suffix == ".log" for entry in folder.iterdir()):
+        (folder / MANIFEST).unlink(missing_ok=True)
+
+
+def record(cfg: DictConfig, folder: Path) -> None:
+    """Write what Hydra records of a job, .hydra/*.yaml: once the folder is this run's, which Hydra does not ask."""
+    hydra = HydraConfig.instance().cfg
+    assert hydra is not None
+    parts = {"config": cfg, "hydra": hydra, "overrides": HydraConfig.get().overrides.task}
+    for name, part in parts.items():
+        with replacing(folder / ".hydra" / f"{name}.yaml") as temporary:
+            temporary.write_text(OmegaConf.to_yaml(part), encoding="utf-8")
+
+
+def _read_manifest(path: Path) -> dict[str, Any]:
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+        manifest["config_hash"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise SettingError(f"{path}: {error}: expected a run's manifest; remove the folder to run again") from None
+    return dict(manifest)

@@ -19,11 +19,11 @@ from torchfovea.experiments.build import whole
 from torchfovea.experiments.cells import METRICS, Task, cells_of, run_task, task_name
 from torchfovea.experiments.claims import Claim, Verdict, judge, read_claims, select
 from torchfovea.experiments.fig5 import judge_fig5
-from torchfovea.experiments.manifest import finished
+from torchfovea.experiments.manifest import complete, finished
 from torchfovea.experiments.progress import progress_bar
 from torchfovea.experiments.report import write_report
 from torchfovea.experiments.workers import worker_pool
-from torchfovea.files import write_csv, write_json, write_result
+from torchfovea.files import write_csv, write_json
 from torchfovea.mistakes import describe
 from torchfovea.setting import SettingError
 
@@ -64,7 +64,7 @@ def run(cfg: DictConfig) -> float:
         figures[f"claims_{name}"] = sum(entry["verdict"] == verdict for entry in stated)
     figures |= {"episodes": len(rows), "seconds": seconds, "scenes": plain["episodes"]}
     write_report(folder, plain, rows, stated, figures, fig5)
-    write_result(folder, figures)
+    complete(folder, figures)
     _print(stated)
     return float(figures["claims_hold"])
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchfovea.arena import Look, Truth, stack
 from torchfovea.deciding.strategies import Strategy
 from torchfovea.episode import Episode, run_episode, run_episodes, stack_minds
-from torchfovea.experiments.build import build_arena, build_cells, build_scene_of, number, whole
+from torchfovea.experiments.build import build_arena, build_cells, build_scene_of, choice, number, whole
 from torchfovea.experiments.strategy import build_stop, build_strategy
 from torchfovea.perception import Mind, Observer, Step, new_mind
 from torchfovea.sensing.head import Head
@@ -31,6 +31,18 @@ StrategyFor = Callable[[Sequence[Truth]], Strategy]
 def batched(cfg: DictConfig) -> bool:
     """Whether the episodes of a configuration can advance together."""
     return cfg.fidelity == "geometric" and cfg.motor == "instant"
+
+
+def device_of(cfg: DictConfig) -> str:
+    """Where episodes are computed; what cannot run there is refused.
+
+    Raises:
+        SettingError: for another word, a machine without the device, and episodes that run on the CPU alone.
+    """
+    device = choice(cfg, "device", ("cpu", "cuda"))
+    require(device == "cpu" or torch.cuda.is_available(), "device", device, "cpu, or cuda on a machine that has it")
+    require(device == "cpu" or batched(cfg), "device", device, "cpu, or fidelity=geometric motor=instant")
+    return device
 
 
 def sample_of(cfg: DictConfig) -> int | None:
@@ -115,8 +127,7 @@ def roll_out(
     """
     parts = [prepare(cfg, observer, seed) for seed in seeds]
     scenes, minds, truths, generators = (list(part) for part in zip(*parts, strict=True))
-    device = str(OmegaConf.select(cfg, "device") or "cpu")
-    require(device == "cpu" or torch.cuda.is_available(), "device", device, "cpu, or cuda on a machine that has it")
+    device = device_of(cfg) if "device" in cfg else "cpu"
     mind = _to(stack_minds(minds), device)
     if strategy is None:
         aims = stack([_aim(truth) for truth in truths]).to(device)
@@ -126,7 +137,7 @@ def roll_out(
     return run_episodes(
         dataclasses.replace(observer, acquisition=chosen),
         mind,
-        GeometricArenas(scenes, observer, sample_of(cfg), device),
+        GeometricArenas(scenes, observer, sample_of(cfg), device, seeds=seeds),
         truths,
         whole(cfg, "saccades"),
         generators,

@@ -14,14 +14,15 @@ from rich.table import Table
 from torchfovea.arena import Look
 from torchfovea.config import run_folder
 from torchfovea.episode import Episode
-from torchfovea.experiments.build import build_matcher, build_observer, choice, whole
-from torchfovea.experiments.manifest import finished
+from torchfovea.experiments.build import build_matcher, build_observer, choice, number, whole
+from torchfovea.experiments.manifest import complete, finished
 from torchfovea.experiments.progress import progress_bar
-from torchfovea.experiments.rollout import batched, one_episode, roll_out
-from torchfovea.experiments.strategy import build_strategy
+from torchfovea.experiments.rollout import batched, device_of, one_episode, roll_out, sample_of
+from torchfovea.experiments.strategy import build_stop, build_strategy
 from torchfovea.experiments.workers import worker_pool
-from torchfovea.files import write_csv, write_result
+from torchfovea.files import write_csv
 from torchfovea.perception import Observer, Step
+from torchfovea.setting import require
 
 __all__ = ["EPISODE_COLUMNS", "SACCADE_COLUMNS", "episode_row", "run", "saccade_rows", "summarize"]
 
@@ -42,6 +43,9 @@ def run(cfg: DictConfig) -> float:
     observer, folder = build_observer(cfg), run_folder()
     choice(cfg, "fidelity", ("photometric", "geometric"))
     choice(cfg, "motor", ("instant", "physics"))
+    device_of(cfg), sample_of(cfg), whole(cfg, "batch"), whole(cfg, "workers"), number(cfg, "far_m")
+    number(cfg, "near_target_m"), build_stop(cfg)
+    require(isinstance(cfg.picture, bool), "picture", cfg.picture, "true or false")
     build_strategy(cfg, observer), build_matcher(cfg)  # mistakes come first, also in what is not used
     done = finished(cfg, folder)
     if done is not None:
@@ -65,7 +69,7 @@ def run(cfg: DictConfig) -> float:
     if cfg.picture:
         _draw(folder, cfg, observer.retina, last, rows[-1])
     figures = summarize(rows)
-    write_result(folder, figures)
+    complete(folder, figures)
     _print(figures)
     return float(figures["gap_per_saccade"])
 

@@ -16,10 +16,10 @@ from torch import Tensor
 
 from torchfovea.config import run_folder
 from torchfovea.experiments.build import build_observer, construct, number, whole
-from torchfovea.experiments.manifest import finished
+from torchfovea.experiments.manifest import complete, finished
 from torchfovea.experiments.progress import progress_bar
 from torchfovea.experiments.tune_study import check_study, study_curves, study_gradients
-from torchfovea.files import replacing, write_csv, write_result
+from torchfovea.files import replacing, write_csv
 from torchfovea.memory.sphere import direction_mixture, sphere_quadrature
 from torchfovea.setting import require
 from torchfovea.studies.significance import bootstrap_interval
@@ -155,7 +155,7 @@ def _run(cfg: DictConfig) -> float:
 
     draw_tuning(folder, problem, start, state, checks, rows)
     write_csv(folder / "tuning.csv", ("episodes", "validation"), [(e, v) for e, v, _ in state.history])
-    write_result(folder, figures)
+    complete(folder, figures)
     Console().print(table)
     return best
 

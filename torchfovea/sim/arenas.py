@@ -12,6 +12,7 @@ from torchfovea.arena import Fixation, Look, Move
 from torchfovea.perception import Observer
 from torchfovea.sensing.geometric import correspond_points
 from torchfovea.sensing.head import Gaze, clamp_gaze, cyclopean, eyes, to_ego
+from torchfovea.setting import require
 from torchfovea.sim.arena import draw_fields
 from torchfovea.sim.model import Scene
 from torchfovea.sim.motor import InstantMotor
@@ -30,7 +31,7 @@ class GeometricArenas:
         sample: how many receptive fields a look goes through, drawn anew each time; None: all of them.
         device: where rays are traced, in float64.
         motor: its model of durations.
-        seed: of the encoders' noise, see `torchfovea.sim.arena.Arena`.
+        seeds: of each row's encoder noise, see `torchfovea.sim.arena.Arena`; by default 0, 1, ...
     """
 
     def __init__(
@@ -40,7 +41,7 @@ class GeometricArenas:
         sample: int | None = None,
         device: torch.device | str = "cpu",
         motor: InstantMotor | None = None,
-        seed: int = 0,
+        seeds: Sequence[int] | None = None,
     ) -> None:
         self.observer, self.sample, self.motor = observer, sample, motor or InstantMotor()
         self.solids = solids_of(scenes, device)
@@ -49,7 +50,9 @@ class GeometricArenas:
             [torch.nn.functional.pad(scene.kind, (0, most - len(scene.kind)), value=-1) for scene in scenes]
         ).to(device)
         self.before = torch.zeros(len(scenes), 3, dtype=torch.float64)
-        self.noise = torch.Generator().manual_seed(seed)
+        seeds = range(len(scenes)) if seeds is None else seeds
+        require(len(seeds) == len(scenes), "seeds", len(seeds), f"one for each of {len(scenes)} scenes")
+        self.noise = [torch.Generator().manual_seed(seed) for seed in seeds]
 
     def saccade(self, gaze: Gaze) -> Move:
         """Turn each head to its gaze, clamped to the limits; the gazes that come back are what the encoders tell."""
@@ -63,7 +66,7 @@ class GeometricArenas:
             for then, now in zip(zip(*last, strict=True), zip(*command, strict=True), strict=True)
         ]
         self.before = torch.stack(command, -1)
-        error = torch.randn(self.before.shape, generator=self.noise, dtype=torch.float64)
+        error = torch.stack([torch.randn(3, generator=g, dtype=torch.float64) for g in self.noise])
         told = Gaze(*(self.before + math.radians(head.encoder_deg) * error).unbind(-1))
         return Move(told, torch.tensor(seconds, dtype=torch.float64), degrees)
 

@@ -17,7 +17,7 @@ from torchfovea.sensing.correspondence import Budget, Correspondences
 from torchfovea.sensing.head import Eyes
 from torchfovea.sensing.triangulation import observe
 from torchfovea.sensing.unscented import SigmaPoints
-from torchfovea.stereo.matching import match_sgbm
+from torchfovea.stereo.matchers import Matcher, match_eyes
 from torchfovea.stereo.rig import verged
 from torchfovea.stereo.sgbm import SGBM
 from torchfovea.studies.characterization import PlaneSensor, correspond_plane, solid_angle_sr, straight_eyes
@@ -105,7 +105,7 @@ def pool_sights(sights: list[Sight]) -> Sight:
 
 
 def look_at_plane(
-    sensor: PlaneSensor, size_px: int, distance_m: float, vergence_rad: float, seed: int, matcher: SGBM | None = None
+    sensor: PlaneSensor, size_px: int, distance_m: float, vergence_rad: float, seed: int, matcher: Matcher | None = None
 ) -> Sight:
     """Draw a textured plane for both eyes, match the images through the retinas, and measure every receptive field.
 
@@ -115,7 +115,7 @@ def look_at_plane(
         distance_m: the plane, > 0.
         vergence_rad: angle between the optical axes.
         seed: of the texture.
-        matcher: its parameters; it searches from 0.7 times the distance to infinity.
+        matcher: any; it searches from 0.7 times the distance to infinity.
 
     Raises:
         SettingError: for impossible settings, and without OpenCV.
@@ -125,7 +125,8 @@ def look_at_plane(
     left, right = draw_plane(camera, retina.radius_px, size_px, pose, distance_m, seed)
     budget = replace(sensor.budget, source_px=size_px)
     rig = verged(vergence_rad, sensor.baseline_m)
-    matches, _ = match_sgbm(left, right, rig, camera, retina, matcher, budget, nearest_range_m=0.7 * distance_m)
+    near = (matcher or Matcher(SGBM()))._replace(nearest_m=0.7 * distance_m)
+    matches, _ = match_eyes(near, left, right, rig, camera, retina, budget)
     px = retina.centers_px(dtype=left.dtype)
     true, points = correspond_plane(replace(sensor, budget=budget), px, pose, distance_m)
     rho, sigma, valid = _inverse_range(sensor, matches, pose, px)

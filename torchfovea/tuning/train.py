@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -200,8 +200,12 @@ def _validate(problem: Problem, schedule: Schedule, state: State) -> None:
 
 
 def _signature(schedule: Schedule, problem: Problem) -> dict[str, Any]:
+    observer, task = problem.task.observer, problem.task._asdict()
+    del task["observer"]
+    # all of the observer but its strategy, a function, which a checkpoint cannot hold and the simulator has its own of
+    parts = {f.name: repr(getattr(observer, f.name)) for f in fields(observer) if f.name != "acquisition"}
     return {"schedule": asdict(schedule), "shape": asdict(problem.shape), "cells": problem.cells,
-            "distribution": asdict(problem.distribution), "task": repr(problem.task)}  # fmt: skip
+            "distribution": asdict(problem.distribution), **task, **parts}  # fmt: skip
 
 
 def _save(state: State, schedule: Schedule, problem: Problem, path: Path | None) -> None:
@@ -220,7 +224,5 @@ def _load(problem: Problem, schedule: Schedule, path: Path) -> State:
         ) from error
     now = _signature(schedule, problem)
     for name, value in now.items():
-        if name == "task":  # holds a function's address
-            continue
         require(made_with.get(name) == value, f"checkpoint {name}", made_with.get(name), f"the run's own, {value}")
     return state
