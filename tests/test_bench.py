@@ -4,14 +4,14 @@ import csv
 import dataclasses
 import json
 import math
-import time
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from torchfovea.bench import paths, retina_paths, steps
+from torchfovea.bench import paths, retina_paths, steps, timing
 from torchfovea.bench.look import saccade
 from torchfovea.bench.timing import Growth, Path, copy_bandwidth, interleaved, nbytes, same, slope
 from torchfovea.cli import main
@@ -113,21 +113,23 @@ def test_same_says_what_differs():
             same("x", ours, theirs, 1)
 
 
-def test_times_are_medians_taken_in_turns():
-    order = []
+def test_times_are_medians_taken_in_turns(monkeypatch):
+    """By a clock that only the work moves."""
+    order, now = [], [0.0]
+    clock = SimpleNamespace(perf_counter=lambda: now[0], sleep=lambda seconds: None)
+    monkeypatch.setattr(timing, "time", clock)
 
     def work(name, seconds):
         order.append(name)
-        time.sleep(seconds)
+        now[0] += seconds
 
     slow, fast = interleaved([lambda: work("slow", 0.012), lambda: work("fast", 0.002)], 0.2)
     assert slow.runs == fast.runs >= 3
-    assert 12 <= slow.low_ms <= slow.median_ms <= slow.high_ms
-    assert 2 <= fast.median_ms < slow.median_ms
+    assert slow[:3] == pytest.approx((12, 12, 12)) and fast[:3] == pytest.approx((2, 2, 2))
     assert order[:8] == ["slow", "fast", "slow", "fast", "fast", "slow", "slow", "fast"]
     assert len(order) == 2 * (slow.runs + 1)
     order.clear()
-    assert interleaved([lambda: work("one", 0)], 0.0, warm=True)[0].runs == len(order) == 3
+    assert interleaved([lambda: work("one", 0.001)], 0.0, warm=True)[0].runs == len(order) == 3
 
 
 @pytest.mark.parametrize("power", [0.0, 0.5, 1.0, 2.0])

@@ -184,7 +184,8 @@ def test_one_failing_job_does_not_stop_the_others(launcher, job, capfd, tmp_path
     if launcher == "joblib":
         # Workers look the command up for themselves: give them the real one, whose checks fail for one job.
         COMMANDS["doctor"] = Command("torchfovea.doctor:run", "", "")
-        sweep = ["probe_timeout_s=60,-1", "hydra.launcher.n_jobs=2"]
+        # They may be those of an earlier sweep, which keep its working folder: the path is absolute.
+        sweep = ["probe_timeout_s=60,-1", "hydra.launcher.n_jobs=2", f"hydra.sweep.dir={tmp_path}/multirun/doctor/it"]
         failed = {"1": "probe_timeout_s = -1: expected a positive number"}
         count = 2
     else:

@@ -77,9 +77,9 @@ def test_a_fovea_looks_where_it_knows_least():
 
 def test_information_gain_of_two_thousand_by_two_thousand_is_cheap():
     cells = sphere(2000, dtype=torch.float32)
-    start = time.perf_counter()
+    start = time.process_time()  # the processor's, which a busy machine does not change
     im.gaze_information_gain(torch.rand(2000), cells, cells, im.eccentricity_law(0.01, 0.3), 0.8)
-    assert time.perf_counter() - start < 5  # tens of milliseconds on an idle machine
+    assert time.process_time() - start < 5  # tens of milliseconds
 
 
 @pytest.mark.parametrize("sigma", [(0.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (math.nan, 1.0), (1.0, math.inf)])
