@@ -42,6 +42,8 @@ FLOORS = (
         "association",
         "pooling",
         "egosphere",
+        "voting",
+        "update",
         "encoders",
         "moving",
         "store",

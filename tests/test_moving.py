@@ -6,11 +6,12 @@ import pytest
 import torch
 
 from torchfovea.gaussian import Gaussian, unpack
-from torchfovea.memory.egosphere import Fusion, Prior, belief, cartesian_belief, fuse, new_egosphere
+from torchfovea.memory.egosphere import Fusion, Prior, belief, cartesian_belief, new_egosphere
 from torchfovea.memory.moving import Motion, motion, move, resample
 from torchfovea.memory.nearest import build_index, neighbour_spacing_rad
 from torchfovea.memory.pooling import pool, pool_patches
 from torchfovea.memory.sphere import fibonacci_directions
+from torchfovea.memory.update import fuse
 from torchfovea.sensing.chart import basis
 from torchfovea.setting import SettingError
 

@@ -5,10 +5,11 @@ import pytest
 import torch
 
 from torchfovea.gaussian import Information
-from torchfovea.memory.egosphere import EgoSphere, Prior, fuse, new_egosphere
+from torchfovea.memory.egosphere import EgoSphere, Prior, new_egosphere
 from torchfovea.memory.pooling import pool_patches
 from torchfovea.memory.sphere import fibonacci_directions
 from torchfovea.memory.store import load_memory, save_memory
+from torchfovea.memory.update import fuse
 from torchfovea.setting import SettingError
 
 

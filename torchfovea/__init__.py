@@ -11,8 +11,9 @@ from torchfovea.deciding.acquisition import (
     upper_confidence_bound,
 )
 from torchfovea.gaussian import Gaussian, Information
-from torchfovea.memory.egosphere import EgoSphere, Fusion, Prior, belief, cartesian_belief, new_egosphere, remember
+from torchfovea.memory.egosphere import EgoSphere, Fusion, Prior, belief, cartesian_belief, new_egosphere
 from torchfovea.memory.sphere import DirectionMixture, direction_mixture, log_density, sample
+from torchfovea.memory.update import remember
 from torchfovea.perception import Eligibility, Observer, decide, new_mind, perceive
 from torchfovea.sensing.camera import Fisheye, Pinhole
 from torchfovea.sensing.correspondence import Budget, Correspondences

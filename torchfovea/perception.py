@@ -15,24 +15,28 @@ from torchfovea.deciding.reward import RewardBelief, inverse_range_from_range, r
 from torchfovea.deciding.strategies import DEFAULT, Strategy, View, evaluate
 from torchfovea.gaussian import Gaussian
 from torchfovea.memory.egosphere import (
-    Common,
     EgoSphere,
     Fusion,
     Prior,
     belief,
+    cartesian_belief,
     cartesian_from_patches,
     new_egosphere,
-    remember,
+    trust,
 )
 from torchfovea.memory.encoders import encoder_covariance
 from torchfovea.memory.nearest import CellIndex, build_index, neighbour_spacing_rad
+from torchfovea.memory.update import Common, remember
+from torchfovea.memory.voting import against
 from torchfovea.sensing.camera import Camera, Pinhole
-from torchfovea.sensing.correspondence import Budget, Correspondences
-from torchfovea.sensing.head import Eyes, Gaze, Head, cyclopean, fixate
+from torchfovea.sensing.correspondence import Budget, Correspondences, kinship
+from torchfovea.sensing.head import Eyes, Gaze, Head, cyclopean, fixate, to_ego
 from torchfovea.sensing.layout import LogPolar, Retina
 from torchfovea.sensing.triangulation import observe
 from torchfovea.sensing.unscented import SigmaPoints
 from torchfovea.setting import require
+
+SAME_GAZE_DEG = 2.0  # looks nearer to each other than about this see the same pixels of the same surfaces
 
 __all__ = ["Eligibility", "Mind", "Observer", "Step", "decide", "gaze_at", "new_mind", "perceive", "reward_of"]
 
@@ -96,11 +100,13 @@ class Mind(NamedTuple):
         memory: the ego-sphere.
         lookup: finds the cell of a direction.
         spacing_rad: distance of each cell to its neighbours, (..., Nx).
+        axis: where the left eye looked last, unit (..., 3) in E; None: there was no look.
     """
 
     memory: EgoSphere
     lookup: CellIndex
     spacing_rad: Tensor
+    axis: Tensor | None = None
 
 
 class Step(NamedTuple):
@@ -155,12 +161,36 @@ def perceive(
     sigma = math.radians(observer.head.encoder_deg)
     if common is None and sigma > 0:
         common = partial(encoder_covariance, eyes=eyes, sigma_rad=(sigma,) * 3, chart=observer.fusion.chart)
-    memory = remember(mind.memory, mind.lookup, mind.spacing_rad, observed, observer.fusion, observer.prior, common)
-    return mind._replace(memory=memory)
+    axis = eyes.R_left[..., 2]
+    kin = kinship(observer.budget, observer.retina, matches.left_px, 1 / share)
+    if kin is not None and mind.axis is not None:
+        # what looks at one place from one gaze share is all that its fields share
+        same = torch.exp(-(((axis - mind.axis).norm(dim=-1, keepdim=True) / math.radians(SAME_GAZE_DEG)).square()))
+        kin = kin._replace(lasting=kin.lasting + (kin.shared - kin.lasting) * same)
+    before = mind.memory
+    after = remember(before, mind.lookup, mind.spacing_rad, observed, observer.fusion, observer.prior, common, kin)
+    missed = (before.looks > 0) & (after.looks == before.looks) & _in_view(observer, before, eyes)
+    return mind._replace(memory=after._replace(votes=against(after.votes, missed)), axis=axis)
+
+
+def _in_view(observer: Observer, memory: EgoSphere, eyes: Eyes) -> Tensor:
+    """Which cells' points fall on both retinas, bool (..., Nx)."""
+    with torch.no_grad():
+        points = cartesian_belief(memory, observer.fusion.chart).mean
+        inside = torch.ones_like(memory.looks, dtype=torch.bool)
+        for rotation, origin in ((eyes.R_left, eyes.t_left), (eyes.R_right, eyes.t_right)):
+            direction = to_ego(rotation.mT, points - origin.unsqueeze(-2))
+            inside &= observer.camera.in_view(direction) & observer.retina.inside(observer.camera.project(direction))
+    return inside
 
 
 def reward_of(observer: Observer, mind: Mind) -> tuple[Gaussian, RewardBelief]:
-    """Each cell's 3-D belief and reward (Eq. 36-40). Unseen cells share the prior's reward exactly: ties are ties."""
+    """Each cell's 3-D belief and reward (Eq. 36-40).
+
+    A surface is worth its reward as far as it is believed, for the rest what an unseen cell is: mean and standard
+    deviation are averaged with the prior's by `torchfovea.memory.egosphere.trust`, so that no doubtful surface wins a
+    comparison of thousands. Unseen cells share the prior's reward exactly: ties are ties.
+    """
     moments = belief(mind.memory)
     prior = observer.prior
     if observer.fusion.chart == "cartesian":
@@ -175,9 +205,18 @@ def reward_of(observer: Observer, mind: Mind) -> tuple[Gaussian, RewardBelief]:
         unseen = RewardBelief(*(torch.tensor(v, dtype=points.mean.dtype) for v in (prior.mean, prior.std)))
         if observer.reward == "range":
             reward, unseen = range_from_inverse_range(reward), range_from_inverse_range(unseen)
-    seen = mind.memory.looks > 0
-    exact = (torch.where(seen, now, then.to(now)) for now, then in zip(reward, unseen, strict=True))
+    sure = trust(mind.memory)
+    exact = (
+        torch.where(sure > 0, sure * now + (1 - sure) * then, then.to(now))
+        for now, then in zip(reward, unseen, strict=True)
+    )
     return points, RewardBelief(*exact)
+
+
+def _unseen_points(observer: Observer, mind: Mind) -> Tensor:
+    """Where each cell's point would be if it had not been seen, (..., Nx, 3) [m]."""
+    prior = observer.prior.mean
+    return mind.memory.cells * (prior if observer.fusion.chart == "cartesian" else 1 / prior)
 
 
 def decide(
@@ -197,8 +236,12 @@ def decide(
         before: the decision before, for strategies that remember.
     """
     points, reward = reward_of(observer, mind)
-    target, reachable = fixate(observer.head, points.mean)
     seen = mind.memory.looks > 0
+    # the eyes meet where the surface is, or where an unseen one would be while it is more likely not there
+    doubted = seen & (trust(mind.memory) < 0.5)
+    target, reachable = fixate(
+        observer.head, torch.where(doubted[..., None], _unseen_points(observer, mind), points.mean)
+    )
     ground = seen & (points.mean[..., 2] + observer.head.ego_height_m < observer.eligibility.ground_z_m)
     far_enough = (points.mean * points.mean).sum(-1) > observer.eligibility.nearest_m**2
     eligible = reachable & far_enough & ~ground

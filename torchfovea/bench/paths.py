@@ -15,9 +15,10 @@ from torchfovea.bench.look import Saccade, flat_of, moved_to, part_of, shares, s
 from torchfovea.bench.timing import Growth, Path, Peer, nbytes, same
 from torchfovea.gaussian import Gaussian, columns, pack, unpack
 from torchfovea.memory.association import Pairs, associate, gather_columns
-from torchfovea.memory.egosphere import Prior, belief, fuse, new_egosphere
+from torchfovea.memory.egosphere import Prior, belief, new_egosphere
 from torchfovea.memory.nearest import nearest_cell
 from torchfovea.memory.pooling import pool, pool_patches
+from torchfovea.memory.update import fuse
 from torchfovea.perception import new_mind
 from torchfovea.sensing.chart import basis
 from torchfovea.sensing.triangulation import Observations, observe

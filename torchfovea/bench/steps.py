@@ -74,6 +74,8 @@ def _decide(look: Saccade) -> Path:
             information=type(memory.information)(*(columns(*p[:size].unbind(-1)) for p in memory.information)),
             bearing=memory.bearing[:size],
             looks=memory.looks[:size],
+            lasting=columns(*memory.lasting[:size].unbind(-1)),
+            votes=columns(*memory.votes[:size].unbind(-1)),
         )
         return partial(decide, observer, mind._replace(memory=less))
 

@@ -6,15 +6,12 @@ on different rays of one cell enter exactly, wherever in the cell they fall; a s
 nor passes for noise. In the cell's own frame (e₁, e₂, p) the state is (g₁, g₂, ρ), the slope of the inverse range and
 the inverse range itself; an observation of ρ in direction u is the row (u·e₁, u·e₂, u·p) of a linear filter.
 
-One saccade's observations enter in three moves. *Pool*: the observations of a cell add up in information form, as the
-paper fuses all (Eq. 34-35). *Add*: what they share, and no averaging removes, is added to the pooled covariance.
-*Fuse*: the result joins the memory.
+How a look enters is `torchfovea.memory.update`'s.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -22,32 +19,21 @@ import torch
 from torch import Tensor
 
 from torchfovea.gaussian import Gaussian, Information, columns, gaussian_from_information
-from torchfovea.memory.association import associate, gather_columns
-from torchfovea.memory.nearest import CellIndex
-from torchfovea.memory.pooling import Pooled, add_common, found_points, nearness, pool, pool_in_front
-from torchfovea.sensing.chart import turn_cartesian
-from torchfovea.sensing.triangulation import Observations
 from torchfovea.setting import require
 
 __all__ = [
-    "Common",
     "EgoSphere",
     "Fusion",
     "Prior",
     "belief",
+    "blend",
     "cartesian_belief",
     "cartesian_from_patches",
     "forget",
-    "fuse",
     "new_egosphere",
     "prior_information",
-    "remember",
-    "settle",
+    "trust",
 ]
-
-
-Common = Tensor | Callable[[Tensor], Tensor]
-"""Packed covariance (..., Nx, 6) that a saccade's observations share, or a function of their points (..., Nx, 3)."""
 
 
 class EgoSphere(NamedTuple):
@@ -58,12 +44,17 @@ class EgoSphere(NamedTuple):
         information: vector (..., Nx, 3) and packed matrix (..., Nx, 6), of (x, y, z) or of a patch (g₁, g₂, ρ).
         bearing: how well the patches' places across the line of sight are known [1/rad²], (..., Nx); zero in x, y, z.
         looks: how many saccades brought each cell something, (..., Nx); 0 is unseen.
+        lasting: (..., Nx, 2), what says how much of a patch's error no further look takes away. With u the variance of
+            a look's inverse range and l what of it lasts: the sums over looks of √l/u and of l/u², see `belief`.
+        votes: (..., Nx, 2), looks for and against what the cell believes, see `torchfovea.memory.voting`.
     """
 
     cells: Tensor
     information: Information
     bearing: Tensor
     looks: Tensor
+    lasting: Tensor
+    votes: Tensor
 
 
 @dataclass(frozen=True)
@@ -100,10 +91,11 @@ class Fusion:
         gate_deg: observations farther than this from their cell are dropped, unless their receptive field covers it.
         gate_spacing: the gate is at least this many times the cell's distance to its neighbour.
         fill: whether a cell within a receptive field's cover that got no observation takes the nearest one.
-        conflict: patches only. Two inverse ranges this many standard deviations apart are two surfaces, and E sees the
-            nearer one alone; inf: they are averaged.
-        erode: the share of its information that a cell keeps when a saccade sees past it: once it is the eyes'
-            parallax, again and again the memory was wrong. 0: the latest look is believed, which false matches need.
+        conflict: patches only. Two inverse ranges this many standard deviations apart are two surfaces, and a cell
+            believes the one that most looks speak for; inf: they are averaged.
+        window: patches only. How many looks the votes for and against a surface remember: as long, about, as the
+            memory holds against the looks to one that has gone.
+        nearest_m: patches only. Nearest range that a false match shows: they are even in inverse range up to here.
         half_life: saccades after which half of the information is forgotten; inf: never.
     """
 
@@ -112,7 +104,8 @@ class Fusion:
     gate_spacing: float = 2.0
     fill: bool = True
     conflict: float = 4.0
-    erode: float = 0.0
+    window: float = 5.0
+    nearest_m: float = 0.3
     half_life: float = math.inf
 
     def __post_init__(self) -> None:
@@ -123,7 +116,8 @@ class Fusion:
             require(0 <= getattr(self, name) <= 1e6, f"fusion.{name}", getattr(self, name), "0 to 1e6")
         require(isinstance(self.fill, bool), "fusion.fill", self.fill, "true or false")
         require(self.conflict > 0, "fusion.conflict", self.conflict, "a positive number of standard deviations")
-        require(0 <= self.erode <= 1, "fusion.erode", self.erode, "a share from 0 to 1")
+        require(1 <= self.window < math.inf, "fusion.window", self.window, "a number of looks, at least 1")
+        require(0 < self.nearest_m < math.inf, "fusion.nearest_m", self.nearest_m, "a positive distance in metres")
         require(self.half_life > 0, "fusion.half_life", self.half_life, "a positive number of saccades")
 
     @property
@@ -166,41 +160,22 @@ def new_egosphere(cells: Tensor, prior: Prior, chart: str = "inverse_range") -> 
     require(cells.numel() > 0, "memory.cells", cells.shape[-2], "at least 1")
     unit = bool(((cells * cells).sum(-1) - 1).abs().max() < 1e-3)
     require(unit, "cells", "directions", "finite unit vectors")
-    return EgoSphere(cells, *prior_information(cells, prior, chart), torch.zeros_like(cells[..., 0]))
+    zero = torch.zeros_like(cells[..., 0])
+    return EgoSphere(cells, *prior_information(cells, prior, chart), zero, columns(zero, zero), columns(zero, zero))
 
 
-def settle(memory: EgoSphere, pooled: Pooled, fusion: Fusion, prior: Prior) -> tuple[EgoSphere, Pooled]:
-    """A z-buffer between what is remembered and what a saccade brought; patches only.
-
-    Where the two are `fusion.conflict` standard deviations apart they are two surfaces. If the new one is nearer, the
-    cell forgets the old one, which it hides. If it is farther, the eyes looked past the old one, which keeps the share
-    `fusion.erode` of its information while the new one is not entered; with a share of 0 the new one takes its place.
-
-    Differentiable; which is nearer is held fixed.
-    """
-    seen = (memory.looks > 0) & (pooled.hits > 0)
-    with torch.no_grad():
-        new, new_variance = nearness(pooled.information, prior.slope_std**-2, (~seen).to(memory.looks.dtype))
-        old, old_variance = nearness(memory.information)
-        apart = (new - old) * (new_variance + old_variance).rsqrt()
-        nearer, farther = seen & (apart > fusion.conflict), seen & (apart < -fusion.conflict)
-        keep = torch.where(farther, fusion.erode, (~nearer).to(apart.dtype))
-        take = (~farther).to(apart.dtype) if fusion.erode > 0 else torch.ones_like(apart)
-    memory = _blend(memory, prior, "inverse_range", keep)
-    information = Information(*(take[..., None] * part for part in pooled.information))
-    return memory, Pooled(information, take * pooled.bearing, take * pooled.hits)
-
-
-def _blend(memory: EgoSphere, prior: Prior, chart: str, keep: Tensor) -> EgoSphere:
-    """Keep a share (..., Nx) of what was learned; the rest is the prior's."""
-    first, bearing = _prior_scalars(memory.cells, prior, chart)
+def blend(memory: EgoSphere, prior: Prior, chart: str, keep: Tensor) -> EgoSphere:
+    """Keep a share (..., Nx) of what was learned; the rest is the prior's. Differentiable."""
+    first, sure = _prior_scalars(memory.cells, prior, chart)
     less = 1 - keep
     vector, matrix = ([keep * part for part in parts.unbind(-1)] for parts in memory.information)
     for k, (mean, weight) in enumerate(first):
         vector[k] = vector[k] + less * mean
         matrix[(0, 3, 5)[k]] = matrix[(0, 3, 5)[k]] + less * weight
     information = Information(columns(*vector), columns(*matrix))
-    return memory._replace(information=information, bearing=keep * memory.bearing + less * bearing)
+    bearing = keep * memory.bearing + less * sure
+    once, twice = memory.lasting.unbind(-1)
+    return memory._replace(information=information, bearing=bearing, lasting=columns(keep * once, keep * keep * twice))
 
 
 def forget(memory: EgoSphere, prior: Prior, chart: str, keep: float | Tensor) -> EgoSphere:
@@ -216,71 +191,25 @@ def forget(memory: EgoSphere, prior: Prior, chart: str, keep: float | Tensor) ->
     """
     share = torch.as_tensor(keep, dtype=memory.cells.dtype, device=memory.cells.device)
     require(bool(((share >= 0) & (share <= 1)).all()), "keep", keep, "a share from 0 to 1")
-    return _blend(memory, prior, chart, share.expand(memory.looks.shape))
-
-
-def fuse(memory: EgoSphere, pooled: Pooled) -> EgoSphere:
-    """Join one saccade's pooled observations with the memory (Eq. 34-35). Differentiable."""
-    information = Information(*(old + new for old, new in zip(memory.information, pooled.information, strict=True)))
-    return EgoSphere(memory.cells, information, memory.bearing + pooled.bearing, memory.looks + (pooled.hits > 0))
-
-
-def remember(
-    memory: EgoSphere,
-    index: CellIndex,
-    spacing_rad: Tensor,
-    observed: Observations,
-    fusion: Fusion,
-    prior: Prior,
-    common: Common | None = None,
-) -> EgoSphere:
-    """Enter one saccade's observations: associate (Eq. 22-23), pool, add, fuse (Eq. 34-35).
-
-    Args:
-        memory: the ego-sphere before.
-        index: of its cells, from `torchfovea.memory.nearest.build_index`.
-        spacing_rad: distance of each cell to its neighbours (..., Nx).
-        observed: in the fusion's chart; see `associate` for what is left out.
-        fusion: how.
-        prior: what the memory began with.
-        common: see `add_common`; a function of the points that the saccade found, see `torchfovea.memory.encoders`.
-
-    Returns:
-        The ego-sphere after, in the dtype of the one before. Differentiable in the observations (the association is
-        held fixed).
-    """
-    mean, cov, direction, support, valid, inlier = observed
-    mean, cov, direction, support = (part.to(memory.cells.dtype) for part in (mean, cov, direction, support))
-    observed = Observations(mean, cov, direction, support, valid, inlier)
-    cells, batch, chart = memory.cells, memory.cells.shape[:-2], fusion.chart
-    if fusion.half_life < math.inf:
-        memory = forget(memory, prior, chart, 0.5 ** (1 / fusion.half_life))
-    gate_rad = math.radians(fusion.gate_deg)
-    pairs = associate(cells, index, spacing_rad, observed, gate_rad, fusion.gate_spacing, fusion.fill)
-    target = gather_columns(cells, pairs.cell)
-    direction = gather_columns(observed.direction, pairs.observation)
-    if chart == "cartesian":
-        gaussian = Gaussian(*(gather_columns(part, pairs.observation) for part in (observed.mean, observed.cov)))
-        if fusion.name == "aligned":
-            gaussian = turn_cartesian(gaussian, direction, target)
-        pooled = pool(gaussian, pairs.cell, batch, cells.shape[-2])
-    else:
-        pooled = pool_in_front(observed, direction, target, pairs, cells, fusion.conflict, prior.slope_std)
-    if common is not None:
-        if callable(common):
-            common = common(found_points(pooled, cells, chart, prior.slope_std))
-        pooled = add_common(pooled, common.to(cells.dtype), chart, prior.slope_std)
-    if chart == "inverse_range" and fusion.conflict < math.inf:
-        memory, pooled = settle(memory, pooled, fusion, prior)
-    return fuse(memory, pooled)
+    return blend(memory, prior, chart, share.expand(memory.looks.shape))
 
 
 def belief(memory: EgoSphere) -> Gaussian:
     """Moments in the memory's own coordinates, (..., Nx, 3) and (..., Nx, 6): a point, or a patch (g₁, g₂, ρ).
 
-    Differentiable.
+    Looks are averaged with their informations 1/u as weights. Of their variances u the parts l last, so that these err
+    together: with Λ = Σ 1/u, the variance of the mean is (Λ − Σ l/u² + (Σ √l/u)²)/Λ². Differentiable.
     """
-    return gaussian_from_information(memory.information)
+    mean, cov = gaussian_from_information(memory.information)
+    once, twice = memory.lasting.unbind(-1)
+    *rest, variance = cov.unbind(-1)
+    return Gaussian(mean, columns(*rest, variance + variance.square() * (once.square() - twice).clamp(min=0)))
+
+
+def trust(memory: EgoSphere) -> Tensor:
+    """Probability that each cell's surface is there, (..., Nx): the share of votes for it, 0 where unseen."""
+    yes, no = memory.votes.unbind(-1)
+    return yes / (yes + no).clamp(min=torch.finfo(yes.dtype).tiny)
 
 
 def cartesian_belief(memory: EgoSphere, chart: str) -> Gaussian:

@@ -12,7 +12,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchfovea.gaussian import Gaussian, Information, columns, information_from_gaussian, pack, quadratic3, rotate3
+from torchfovea.gaussian import (
+    Gaussian,
+    Information,
+    columns,
+    gaussian_from_information,
+    information_from_gaussian,
+    pack,
+    quadratic3,
+    rotate3,
+)
 from torchfovea.memory.association import gather_columns, in_front
 from torchfovea.memory.egosphere import EgoSphere, Fusion, Prior, belief, new_egosphere, prior_information
 from torchfovea.memory.nearest import CellIndex, build_index, nearest_cell, nearest_observation
@@ -83,18 +92,22 @@ class _Moved(NamedTuple):
         direction: where they are seen, (M, 3).
         bearing: precision across the line of sight (M,).
         looks: (M,).
+        lasting: see `EgoSphere`, relative to the information of the inverse range, (M, 2).
+        votes: (M, 2).
     """
 
     state: Gaussian
     direction: Tensor
     bearing: Tensor
     looks: Tensor
+    lasting: Tensor
+    votes: Tensor
 
 
 def _carry(memory: EgoSphere, step: Motion, chart: str) -> _Moved:
     """Move what was seen; patches whose back the robot would see now are dropped. Float64: planes mix scales."""
     information = Information(*(part.double() for part in memory.information))
-    moments = belief(memory._replace(information=information))
+    moments = gaussian_from_information(information)
     rotation = step.rotation.mT.to(memory.cells.device)
     shift, noise = step.translation.to(memory.cells.device), step.covariance.to(memory.cells.device)
     seen = memory.looks > 0
@@ -129,7 +142,9 @@ def _carry(memory: EgoSphere, step: Motion, chart: str) -> _Moved:
         drift = pack(turned @ noise @ turned.mT)
     state = Gaussian(state.mean, state.cov + drift)
     good = facing & (square > 1e-6) & torch.isfinite(state.cov).all(-1) & torch.isfinite(state.mean).all(-1)
-    return _Moved(Gaussian(state.mean[good], state.cov[good]), direction[good], bearing[good], looks[good])
+    lasting = memory.lasting[seen].double() * columns(cov[..., 5].sqrt(), cov[..., 5])
+    rows = (part[good] for part in (direction, bearing, looks, lasting, memory.votes[seen]))
+    return _Moved(Gaussian(state.mean[good], state.cov[good]), *rows)
 
 
 def move(
@@ -207,7 +222,9 @@ def _put(empty: EgoSphere, got: Tensor, moved: _Moved, source: Tensor, chart: st
     new = information_from_gaussian(Gaussian(mean, cov))
     information = Information(*(_write(old, got, part) for old, part in zip(empty.information, new, strict=True)))
     bearing = _write(empty.bearing, got, moved.bearing[source])
-    return EgoSphere(empty.cells, information, bearing, _write(empty.looks, got, moved.looks[source]))
+    looks, votes = _write(empty.looks, got, moved.looks[source]), _write(empty.votes, got, moved.votes[source])
+    lasting = moved.lasting[source] / columns(cov[..., 5].sqrt(), cov[..., 5])
+    return EgoSphere(empty.cells, information, bearing, looks, _write(empty.lasting, got, lasting), votes)
 
 
 def _write(old: Tensor, rows: Tensor, values: Tensor) -> Tensor:
@@ -263,9 +280,12 @@ def resample(memory: EgoSphere, cells: Tensor, spacing_rad: Tensor, fusion: Fusi
     if chart == "inverse_range":
         turn = _frame(cells[target].double()) @ _frame(memory.cells[source].double()).mT
         vector, matrix = (turn @ vector[..., None])[..., 0], rotate3(turn, matrix)
-    parts = torch.cat([vector, matrix, (memory.bearing - bearing).double()[source][:, None]], -1) * share[:, None]
-    total = torch.zeros(len(cells), 10, dtype=parts.dtype, device=cells.device).index_add(0, target, parts)
+    sums = [vector, matrix, (memory.bearing - bearing).double()[source][:, None]]
+    parts = torch.cat([*sums, memory.lasting.double()[source], memory.votes.double()[source]], -1) * share[:, None]
+    parts[:, 11] *= share  # the second sum of `lasting` is of squares
+    total = torch.zeros(len(cells), 14, dtype=parts.dtype, device=cells.device).index_add(0, target, parts)
     total = columns(*total.to(cells.dtype).unbind(-1))
     information = Information(empty.information.vector + total[..., :3], empty.information.matrix + total[..., 3:9])
     looks = empty.looks.scatter_reduce(0, target, gather_columns(memory.looks[:, None], source)[:, 0], "amax")
-    return EgoSphere(cells, information, empty.bearing + total[..., 9], looks)
+    lasting, votes = columns(*total[..., 10:12].unbind(-1)), columns(*total[..., 12:].unbind(-1))
+    return EgoSphere(cells, information, empty.bearing + total[..., 9], looks, lasting, votes)

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchfovea.gaussian import Gaussian, Information, columns, information_from_gaussian, inverse3, times3
-from torchfovea.memory.association import Pairs, in_front
-from torchfovea.sensing.chart import basis
-from torchfovea.sensing.triangulation import Observations
 
-__all__ = ["Pooled", "add_common", "found_points", "nearness", "pool", "pool_in_front", "pool_patches"]
+__all__ = ["Pooled", "add_common", "found_points", "nearness", "pool", "pool_patches", "share_errors"]
 
 
 class Pooled(NamedTuple):
@@ -87,42 +83,28 @@ def pool_patches(
     return _sum_up([*parts, keep], cell, batch, cells)
 
 
-def pool_in_front(
-    observed: Observations,
-    direction: Tensor,
-    target: Tensor,
-    pairs: Pairs,
-    cells: Tensor,
-    conflict: float,
-    slope_std: float,
-) -> Pooled:
-    """Pool one saccade's inverse ranges, without those that another of the same cell hides from E.
+def share_errors(pooled: Pooled, patches: Tensor, shared: float, lasting: Tensor | float) -> tuple[Pooled, Tensor]:
+    """Count what a look's fields have in common: their errors do not average out as if each erred by itself.
+
+    Over a cell that D patches of common error cover, the mean correlation of its n fields is r/(1 + D), r the share of
+    their variance v that they have in common; the mean of theirs has the variance v (1 − r/(1 + D))/n + v r/(1 + D).
 
     Args:
-        observed: (..., N), in inverse range.
-        direction: of the observations in pairs (M, 3).
-        target: their cells' directions (M, 3).
-        pairs: from `torchfovea.memory.association.associate`.
-        cells: of the memory (..., Nx, 3).
-        conflict: how many standard deviations apart two surfaces are two; inf: all count.
-        slope_std: how steep patches may be [1/m/rad].
+        pooled: from `pool_patches`.
+        patches: D, (..., Nx).
+        shared: r.
+        lasting: the share of v that looks at the same surface have in common, at most r; broadcastable to (..., Nx).
 
-    Differentiable in the observations; which are hidden is held fixed.
+    Returns:
+        The pooled observations with their true information, and the variance of inverse range that lasts (..., Nx).
+        Differentiable.
     """
-    aa, _, _, bb, _, rr = (part.reshape(-1).index_select(0, pairs.observation) for part in observed.cov.unbind(-1))
-    rho = observed.mean[..., 2].reshape(-1).index_select(0, pairs.observation)
-    across = aa + bb
-    # seen in a direction that is itself uncertain: on a slope the inverse range is so too
-    variance = rr + slope_std**2 * across
-    row = columns(*((direction * axis).sum(-1) for axis in (*basis(target), target)))
-    batch, count = cells.shape[:-2], cells.shape[-2]
-    keep = torch.ones_like(rho)
-    if conflict < math.inf:
-        with torch.no_grad():
-            off = row[..., 0] ** 2 + row[..., 1] ** 2
-            std = (variance + slope_std**2 * off).sqrt()
-            keep = in_front(rho, std, pairs.cell, batch.numel() * count, conflict).to(rho.dtype)
-    return pool_patches(rho, variance, 2 / across, row, keep, pairs.cell, batch, count)
+    fields, spread = pooled.hits.clamp(min=1), 1 / (1 + patches)
+    common = shared * spread
+    factor = 1 / (1 + (fields - 1) * common)
+    information = Information(*(factor[..., None] * part for part in pooled.information))
+    pooled = Pooled(information, factor * pooled.bearing, pooled.hits)
+    return pooled, lasting * spread / ((1 - common) / fields + common)
 
 
 def add_common(pooled: Pooled, common: Tensor, chart: str, slope_std: float = 0.0) -> Pooled:

@@ -16,7 +16,7 @@ from torchfovea.setting import SettingError, require
 
 __all__ = ["load_memory", "save_memory"]
 
-_PARTS = ("cells", "vector", "matrix", "bearing", "looks")
+_PARTS = ("cells", "vector", "matrix", "bearing", "looks", "lasting", "votes")
 
 
 def save_memory(path: str | os.PathLike[str], memory: EgoSphere, chart: str) -> None:
@@ -32,7 +32,7 @@ def save_memory(path: str | os.PathLike[str], memory: EgoSphere, chart: str) -> 
     """
     require(str(path).endswith(".npz"), "path", path, "a name that ends in .npz")
     require(chart in ("inverse_range", "cartesian"), "chart", chart, "inverse_range or cartesian")
-    parts = (memory.cells, *memory.information, memory.bearing, memory.looks)
+    parts = (memory.cells, *memory.information, memory.bearing, memory.looks, memory.lasting, memory.votes)
     arrays: dict[str, Any] = {n: part.detach().cpu().numpy() for n, part in zip(_PARTS, parts, strict=True)}
     arrays["chart"] = np.array(chart)
     with replacing(path) as temporary:
@@ -56,11 +56,12 @@ def load_memory(path: str | os.PathLike[str]) -> tuple[EgoSphere, str]:
     chart = str(arrays.pop("chart"))
     parts = {name: torch.from_numpy(array) for name, array in arrays.items()}
     shape = parts["cells"].shape[:-1]
-    ends = {"cells": (3,), "vector": (3,), "matrix": (6,), "bearing": (), "looks": ()}
+    ends = {"cells": (3,), "vector": (3,), "matrix": (6,), "bearing": (), "looks": (), "lasting": (2,), "votes": (2,)}
     good = chart in ("inverse_range", "cartesian") and all(parts[n].shape == (*shape, *e) for n, e in ends.items())
     good = good and all(p.is_floating_point() and bool(torch.isfinite(p).all()) for p in parts.values())
     good = good and len(shape) > 0 and bool(positive_definite(parts["matrix"], 0.0).all())
     require(good, "path", path, "a memory saved by torchfovea")
-    columnar = {name: columns(*parts[name].unbind(-1)) for name in ("cells", "vector", "matrix")}
+    columnar = {name: columns(*parts[name].unbind(-1)) for name, end in ends.items() if end}
     information = Information(columnar["vector"], columnar["matrix"])
-    return EgoSphere(columnar["cells"], information, parts["bearing"], parts["looks"]), chart
+    known = parts["bearing"], parts["looks"], columnar["lasting"], columnar["votes"]
+    return EgoSphere(columnar["cells"], information, *known), chart

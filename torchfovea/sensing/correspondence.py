@@ -13,7 +13,7 @@ from torchfovea.sensing.camera import Pinhole
 from torchfovea.sensing.retina import Retina
 from torchfovea.setting import require
 
-__all__ = ["Budget", "Clues", "Correspondences", "Disparity", "doubt", "eye_sigma_px"]
+__all__ = ["Budget", "Clues", "Correspondences", "Disparity", "Kinship", "doubt", "eye_sigma_px", "kinship"]
 
 
 class Correspondences(NamedTuple):
@@ -105,6 +105,21 @@ class Clues(NamedTuple):
         return Clues(self.bend_px[index], self.gap_px[index], *more)
 
 
+class Kinship(NamedTuple):
+    """What the errors of one look's receptive fields have in common; `kinship` makes it from a budget.
+
+    Attributes:
+        patch: share of a patch of common error that each receptive field covers, (..., N).
+        shared: share of the variance that fields of one patch have in common.
+        lasting: share of the variance that other looks at the same surface have in common with this one; a number, or
+            (..., 1).
+    """
+
+    patch: Tensor
+    shared: float
+    lasting: Tensor | float
+
+
 @dataclass(frozen=True)
 class Budget:
     """What limits a correspondence, as variances that add up: an RF cannot be sharper than its source.
@@ -185,6 +200,27 @@ def eye_sigma_px(budget: Budget, retina: Retina, px: Tensor, clues: Clues | None
     if clues is not None and source > 0:
         square = square + doubt(budget, clues) * source**2
     return square.sqrt()
+
+
+def kinship(budget: Budget, retina: Retina, px: Tensor, looked_through: float = 1.0) -> Kinship | None:
+    """What the errors of receptive fields at places (..., N, 2) of a retina share, by a budget; None: nothing.
+
+    Correlation falls off as exp(−distance/ℓ), ℓ = max(`shared_px` source pixels, `shared_widths` widths), so that a
+    patch of common error has the area 2πℓ².
+
+    Args:
+        budget: its terms `shared` and `lasting`.
+        retina: the layout.
+        px: where the receptive fields are [retinal px].
+        looked_through: the share of all receptive fields that these are.
+    """
+    if budget.shared == 0:
+        return None
+    width = retina.width_px(px)
+    source = 0.0 if budget.source_px is None else 2 * retina.radius_px / budget.source_px
+    length = (budget.shared_widths * width).clamp(min=max(budget.shared_px * source, 1e-6))
+    patch = (width.square() / (2 * math.pi * looked_through * length.square())).clamp(max=1)
+    return Kinship(patch, budget.shared, budget.lasting)
 
 
 def doubt(budget: Budget, clues: Clues) -> Tensor:

@@ -284,10 +284,8 @@ def _affine(coefficients: Tensor | Components, u: Tensor, v: Tensor) -> Tensor:
 
 
 def _transform_form(matches: Correspondences, form: _Form, points: SigmaPoints, rotated: bool) -> _Moments:
-    """The same for pinhole eyes in inverse range, without forming the sigma points: see `bilinear_moments`.
-
-    The form is linear in either place, so that the place's axes u and v move the point by multiples of the form there.
-    """
+    """The same for pinhole eyes in inverse range, without forming the sigma points: see `bilinear_moments`."""
+    # the form is linear in either place, so that a place's axes u and v move the point by multiples of the form there
     (u, v), (there_u, there_v) = matches.left_px.unbind(-1), matches.right_px.unbind(-1)
     by_left = _affine(form.point.unbind(2), there_u, there_v)
     by_right = _affine(form.point[:, :, :2].unbind(1), u, v)

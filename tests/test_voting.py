@@ -1,0 +1,207 @@
+"""Which surface a cell believes in, and what its looks have in common: against loops and Monte Carlo."""
+
+import math
+from itertools import pairwise
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from torchfovea.gaussian import columns
+from torchfovea.memory.egosphere import Fusion, Prior, belief, new_egosphere, trust
+from torchfovea.memory.nearest import build_index, neighbour_spacing_rad
+from torchfovea.memory.pooling import pool_patches, share_errors
+from torchfovea.memory.update import fuse, remember
+from torchfovea.memory.voting import Sight, against, cast
+from torchfovea.sensing.correspondence import Budget, Kinship, kinship
+from torchfovea.sensing.layout import LogPolar
+from torchfovea.sensing.triangulation import Observations
+
+AHEAD = torch.tensor([[1.0, 0, 0]], dtype=torch.float64)
+PRIOR, FUSION = Prior(), Fusion(gate_deg=5)
+ONE = torch.Size([])
+
+
+def look(rho: float, inlier: float = 1.0, fields: int = 9, sigma: float = 0.01) -> Observations:
+    """Fields that see one inverse range straight ahead, exactly."""
+    direction = AHEAD.expand(fields, 3).contiguous()
+    one = torch.ones(fields, dtype=torch.float64)
+    zero = torch.zeros_like(one)
+    cov = columns(1e-9 * one, zero, zero, 1e-9 * one, zero, sigma**2 * one)
+    valid = torch.ones(fields, dtype=torch.bool)
+    return Observations(columns(zero, zero, rho * one), cov, direction, 0.01 * one, valid, inlier * one)
+
+
+def after(*looks: Observations, kin: Kinship | None = None):
+    memory, index, spacing = new_egosphere(AHEAD, PRIOR), build_index(AHEAD), neighbour_spacing_rad(AHEAD)
+    for seen in looks:
+        memory = remember(memory, index, spacing, seen, FUSION, PRIOR, None, kin)
+    return memory
+
+
+def counted(sight, patches, seen, votes, first, limits):
+    """`cast` as its docstring says it, one cell after the other."""
+    mean, std, slope = first
+    conflict, window, nearest = limits
+    keep, anew, out = torch.zeros_like(sight.rho), [], []
+    for c in range(len(seen)):
+        mine = [k for k in range(len(sight.rho)) if sight.cell[k] == c]
+        row = sight.row[mine]
+        g, packed = patches[0][c], patches[1][c]
+        a, b, d, e, f, h = packed.tolist()
+        full = torch.tensor([[a, b, d], [b, e, f], [d, f, h]], dtype=torch.float64)
+        agree, rest = [], []
+        for k, r in zip(mine, row, strict=True):
+            spread = sight.variance[k] + r @ full @ r
+            agree += [k] if seen[c] and (sight.rho[k] - r @ g) ** 2 < conflict**2 * spread else []
+        rest = [k for k in mine if k not in agree]
+        std_of = {
+            k: math.sqrt(sight.variance[k] + slope**2 * (sight.row[k, 0] ** 2 + sight.row[k, 1] ** 2)) for k in rest
+        }
+        edge = max(
+            [float(sight.rho[k]) - conflict * std_of[k] for k in rest if sight.inlier[k] > 0.5], default=-math.inf
+        )
+        ahead = [k for k in rest if float(sight.rho[k]) + conflict * std_of[k] >= edge]
+        odds = {
+            k: min(1.0, math.exp(-(((sight.rho[k] - mean) / std) ** 2) / 2) / (std * math.sqrt(2 * math.pi) * nearest))
+            for k in ahead
+        }
+        hits = len(agree) + len(ahead)
+        yes, no = votes[c].tolist()
+        pro = contra = 0.0
+        if hits:
+            pro = sum(float(sight.inlier[k]) for k in agree) / hits
+            believed = [(float(sight.inlier[k]), odds[k]) for k in ahead]
+            contra = sum(i * o / max(i * o + 1 - i, 1e-12) for i, o in believed) / hits
+        was = yes
+        yes, no = yes + pro, no + (0 if not hits else (1 - pro if agree else contra))
+        new = hits > 0 and (not seen[c] or (no > 1.001 * yes and contra > pro))
+        if new:
+            yes, no = contra, (was if seen[c] else 0.0) + 1 - contra
+        for k in ahead if new else agree:
+            keep[k] = sight.inlier[k]
+        total = max(window, yes + no)
+        out.append((yes * window / total, no * window / total))
+        anew.append(new)
+    return keep, torch.tensor(anew), torch.tensor(out, dtype=torch.float64)
+
+
+@given(st.integers(0, 10_000))
+def test_votes_are_counted_as_in_a_loop(seed):
+    rng = torch.Generator().manual_seed(seed)
+
+    def rand(*shape):
+        return torch.rand(*shape, generator=rng, dtype=torch.float64)
+
+    count, cells = 40, 6
+    cell = torch.randint(0, cells, (count,), generator=rng)
+    truth = torch.where(rand(cells) < 0.5, 0.3, 1.2)
+    rho = truth[cell] + torch.where(rand(count) < 0.3, rand(count), 0.02 * rand(count))
+    row = columns(0.02 * rand(count), -0.02 * rand(count), torch.ones(count, dtype=torch.float64))
+    sight = Sight(rho, 1e-4 + 1e-3 * rand(count), 1e4 * rand(count), row, 0.02 + 0.97 * rand(count), cell)
+    zero = torch.zeros(cells, dtype=torch.float64)
+    small = 1e-4 + 1e-3 * rand(cells)
+    patches = (columns(zero, zero, truth), columns(small + 1, zero, zero, small + 1, zero, small))
+    seen, votes = rand(cells) < 0.7, 3 * columns(rand(cells), rand(cells))
+    given = (seen, votes, (0.4, 0.4, 1.5), (4.0, 5.0, 0.3))
+    ballot, loop = cast(sight, patches, *given), counted(sight, patches, *given)
+    torch.testing.assert_close(ballot.keep, loop[0])
+    assert torch.equal(ballot.anew, loop[1])
+    torch.testing.assert_close(ballot.votes, loop[2])
+
+
+def test_what_no_one_doubts_is_believed_and_what_is_unseen_is_not():
+    memory = new_egosphere(AHEAD, PRIOR)
+    assert trust(memory).item() == 0
+    for rho in (0.01, 0.5, 3.0):
+        assert trust(after(look(rho))).item() == 1
+        assert trust(after(look(rho), look(rho))).item() == 1
+
+
+def test_what_seems_very_near_must_be_seen_twice():
+    near, usual = after(look(2.0, 0.97)), after(look(0.5, 0.97))
+    assert trust(near).item() < 0.05 and trust(usual).item() > 0.95
+    again = trust(after(look(2.0, 0.97), look(2.0, 0.97))).item()
+    assert 0.4 < again < trust(after(*[look(2.0, 0.97)] * 6)).item() < 0.97
+
+
+def test_doubt_that_lasts_is_not_outvoted_by_repetition():
+    assert trust(after(*[look(0.4, 0.6)] * 50)).item() == pytest.approx(0.6, abs=0.02)
+
+
+def test_a_surface_that_is_gone_fades_with_looks_that_miss_it():
+    memory = after(*[look(1.2)] * 20)
+    shares = []
+    for _ in range(8):
+        memory = memory._replace(votes=against(memory.votes, torch.tensor([True])))
+        shares.append(trust(memory).item())
+    assert all(later < sooner for sooner, later in pairwise([1.0, *shares]))
+    assert shares[-1] < 0.5
+    # and another that shows takes its place within the window
+    assert belief(after(*[look(1.2)] * 20, *[look(0.3)] * 5)).mean[0, 2].item() == pytest.approx(0.3, abs=0.01)
+
+
+@pytest.mark.parametrize(("fields", "patches"), [(1, 0.1), (12, 0.5), (40, 3.0)])
+def test_what_fields_share_does_not_average_out(fields, patches):
+    rng, shared, runs = torch.Generator().manual_seed(0), 0.6, 40_000
+    correlation = shared / (1 + patches)
+    common = torch.randn(runs, 1, generator=rng, dtype=torch.float64)
+    own = torch.randn(runs, fields, generator=rng, dtype=torch.float64)
+    error = correlation**0.5 * common + (1 - correlation) ** 0.5 * own
+    ones = torch.ones(fields, dtype=torch.float64)
+    row = columns(0 * ones, 0 * ones, ones)
+    pooled = pool_patches(ones, 0.04 * ones, ones, row, ones, torch.zeros(fields, dtype=torch.int64), ONE, 1)
+    told, share = share_errors(pooled, torch.tensor([patches], dtype=torch.float64), shared, 0.3)
+    claimed = 1 / told.information.matrix[0, 5].item()
+    assert 0.04 * error.mean(1).var().item() == pytest.approx(claimed, rel=0.03)
+    assert share.item() * claimed == pytest.approx(0.04 * 0.3 / (1 + patches))
+
+
+def test_what_lasts_between_looks_stays():
+    rng, runs = torch.Generator().manual_seed(1), 20_000
+    u = torch.tensor([0.04, 0.01, 0.02, 0.09], dtype=torch.float64)
+    part = torch.tensor([0.3, 0.5, 0.2, 0.4], dtype=torch.float64) * u
+    lasting = torch.randn(runs, 1, generator=rng, dtype=torch.float64) * part.sqrt()
+    error = lasting + torch.randn(runs, 4, generator=rng, dtype=torch.float64) * (u - part).sqrt()
+    weight = 1 / u
+    actual = ((error * weight).sum(1) / weight.sum()).var().item()
+    memory = new_egosphere(AHEAD, Prior(mean=0.5, std=50.0))
+    for one, lasts in zip(u, part, strict=True):
+        ones = torch.ones(1, dtype=torch.float64)
+        row = columns(0 * ones, 0 * ones, ones)
+        pooled = pool_patches(0.5 * ones, one * ones, ones, row, ones, torch.zeros(1, dtype=torch.int64), ONE, 1)
+        memory = fuse(memory, pooled, columns(lasts.sqrt() / one, lasts / one**2)[None])
+    assert belief(memory).cov[0, 5].item() == pytest.approx(actual, rel=0.03)
+
+
+def test_a_memory_cannot_be_surer_than_what_lasts():
+    seen, kin = look(0.4, fields=25), Kinship(torch.full((25,), 0.04, dtype=torch.float64), 0.6, 0.3)
+    floor = 0.3 * 0.01**2 / 2  # the fields cover one patch
+    variances = [belief(after(*[seen] * k, kin=kin)).cov[0, 5].item() for k in (1, 2, 10, 200)]
+    assert all(later < sooner for sooner, later in pairwise(variances))
+    assert floor < variances[-1] < 1.1 * floor
+    assert belief(after(*[seen] * 200)).cov[0, 5].item() < 0.02 * floor
+
+
+def test_kinship_counts_fields_by_the_patches_they_cover():
+    retina = LogPolar(2000)
+    px = retina.centers_px()
+    assert kinship(Budget.printed, retina, px) is None and kinship(Budget(), retina, px) is None
+    kin = kinship(Budget(source_px=400, shared=0.5, shared_px=4, shared_widths=2, lasting=0.2), retina, px)
+    width = retina.width_px(px)
+    length = torch.maximum(torch.full_like(width, 2.0), 2 * width)
+    torch.testing.assert_close(kin.patch, width**2 / (2 * math.pi * length**2))
+    half = kinship(Budget(shared=0.5, shared_widths=2), retina, px, 0.5)
+    torch.testing.assert_close(half.patch, kin.patch * 2)
+
+
+def test_gradients_reach_inlier_probabilities():
+    seen = look(0.6, 0.8, 4)
+    inlier = seen.inlier.clone().requires_grad_()
+
+    def figures(p):
+        memory = after(seen._replace(inlier=p), seen._replace(inlier=p, mean=seen.mean + 0.001))
+        return trust(memory), belief(memory).cov[..., 5]
+
+    assert torch.autograd.gradcheck(figures, (inlier,))

@@ -1,0 +1,159 @@
+"""Which surface a cell believes in: every look votes.
+
+Matchers err in two ways: by a little, which a covariance says, and altogether, which none can. So a cell holds one
+surface *and* how far the looks so far speak for it, a Beta belief of the share of them that are true (after Vogiatzis
+and Hernández 2011). An observation that its surface foretells is a vote for it, as far as it is an inlier; one that it
+does not is a vote against it. Where those against are in the majority, the cell takes the surface of the look in place
+of its own. A cell that no look has reached judges its first surface by its prior: false matches lie anywhere, true
+ones where things are wont to be, so that what seems very near must be seen twice.
+
+Votes are shares of a look, not counts of receptive fields: fields that see one patch of surface err together. What
+lasts between looks they share too, so that a doubtful rim stays doubtful however often it is seen.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchfovea.gaussian import columns, quadratic3
+from torchfovea.memory.association import Pairs, gather_columns, in_front
+from torchfovea.sensing.chart import basis
+from torchfovea.sensing.triangulation import Observations
+
+__all__ = ["Ballot", "Sight", "against", "cast", "see"]
+
+
+TIE = 1.001  # votes that differ by less leave a cell what it has: no rounding decides
+
+
+class Sight(NamedTuple):
+    """One look's observations of patches, in pairs with the cells that they fall on.
+
+    Attributes:
+        rho: inverse ranges (M,) [1/m].
+        variance: theirs, with what their directions do not tell (M,).
+        bearing: precision of their directions (M,) [1/rad²].
+        row: their directions in their cells' frames (e₁, e₂, p), (M, 3).
+        inlier: probability that each is true at all (M,).
+        cell: (M,) int64, counted through all batches.
+    """
+
+    rho: Tensor
+    variance: Tensor
+    bearing: Tensor
+    row: Tensor
+    inlier: Tensor
+    cell: Tensor
+
+
+class Ballot(NamedTuple):
+    """What a look decides.
+
+    Attributes:
+        keep: how much each observation counts, its inlier probability or 0, (M,).
+        anew: which cells take the look's surface for their own, bool (..., Nx); unseen ones that it reaches too.
+        votes: (..., Nx, 2), for and against, after it.
+        hits: observations of each cell, (..., Nx).
+    """
+
+    keep: Tensor
+    anew: Tensor
+    votes: Tensor
+    hits: Tensor
+
+
+def see(observed: Observations, pairs: Pairs, cells: Tensor, slope_std: float) -> Sight:
+    """A look's observations as rows of a filter of patches.
+
+    Args:
+        observed: (..., N), in inverse range.
+        pairs: from `torchfovea.memory.association.associate`.
+        cells: of the memory (..., Nx, 3).
+        slope_std: how steep patches may be [1/m/rad]: seen in a direction that is itself uncertain, the inverse range
+            of a slope is so too.
+
+    Differentiable in the observations.
+    """
+    which = pairs.observation
+    aa, _, _, bb, _, rr = (part.reshape(-1).index_select(0, which) for part in observed.cov.unbind(-1))
+    across = aa + bb
+    target, direction = gather_columns(cells, pairs.cell), gather_columns(observed.direction, which)
+    row = columns(*((direction * axis).sum(-1) for axis in (*basis(target), target)))
+    rho = observed.mean[..., 2].reshape(-1).index_select(0, which)
+    sure = observed.inlier is None
+    inlier = torch.ones_like(rho) if sure else observed.inlier.reshape(-1).index_select(0, which)  # type: ignore[union-attr]
+    return Sight(rho, rr + slope_std**2 * across, 2 / across, row, inlier, pairs.cell)
+
+
+def cast(
+    sight: Sight,
+    patches: tuple[Tensor, Tensor],
+    seen: Tensor,
+    votes: Tensor,
+    first: tuple[float, float, float],
+    limits: tuple[float, float, float],
+) -> Ballot:
+    """Count one look's votes.
+
+    Args:
+        sight: of the look.
+        patches: means (..., Nx, 3) and packed covariances (..., Nx, 6) of what cells believe.
+        seen: which cells have a surface, bool (..., Nx).
+        votes: for and against it (..., Nx, 2).
+        first: mean and standard deviation of the prior's inverse range, and how steep patches may be.
+        limits: how many standard deviations apart two surfaces are two; how many looks the votes remember; the nearest
+            range that a false match shows [m].
+
+    Differentiable in the inlier probabilities; which observations agree is held fixed.
+    """
+    mean, std, slope_std = first
+    conflict, window, nearest_m = limits
+    shape, count = seen.shape, seen.numel()
+    has, at = seen.reshape(-1), sight.cell
+    with torch.no_grad():
+        told = has.index_select(0, at)
+        off = sight.row[..., 0].square() + sight.row[..., 1].square()
+        spread = (sight.variance + slope_std**2 * off).sqrt()
+        held = gather_columns(patches[0], at)
+        expected = (sight.row * held).sum(-1)
+        variance = sight.variance + quadratic3(gather_columns(patches[1], at), sight.row)
+        agrees = told & ((sight.rho - expected).square() < conflict**2 * variance)
+        # of what does not agree, the nearest surface hides the rest from E, if it is one
+        rest = ~agrees
+        ahead = rest & in_front(sight.rho, spread, at, count, conflict, rest & (sight.inlier > 0.5))
+        # how much more often true surfaces lie there than false matches, which are even in inverse range
+        usual = math.log(std * math.sqrt(2 * math.pi) * nearest_m) + ((sight.rho - mean) / std).square() / 2
+        odds = torch.exp(-usual.clamp(min=0))
+    inlier = sight.inlier
+    believed = torch.where(agrees, inlier, inlier * odds / (inlier * odds + 1 - inlier).clamp(min=1e-12))
+    for_it, instead = agrees.to(inlier), ahead.to(inlier)
+    sums = torch.zeros(4, count, dtype=inlier.dtype, device=inlier.device)
+    rows = torch.stack([for_it, instead, for_it * believed, instead * believed])
+    agree, other, pro, contra = sums.scatter_add(1, at.expand(4, -1), rows)
+    hits = agree + other
+    share = 1 / hits.clamp(min=1)
+    pro, contra = (pro * share).clamp(max=1), (contra * share).clamp(max=1)
+    yes, no = (part.reshape(-1) for part in votes.unbind(-1))
+    reached, fresh = hits > 0, ~has & (hits > 0)
+    # where nothing agrees the doubt about the look is no vote against the cell
+    more_no = no + torch.where(agree > 0, 1 - pro, contra) * reached
+    more_yes = yes + pro
+    turned = ~fresh & (more_no > TIE * more_yes) & (contra > pro)
+    anew = fresh | turned
+    kept = torch.where(turned, yes, 0.0)
+    more_yes, more_no = torch.where(anew, contra, more_yes), torch.where(anew, kept + 1 - contra, more_no)
+    scale = (window / (more_yes + more_no).clamp(min=window)).detach()
+    new = anew.index_select(0, at)
+    keep = inlier * torch.where(new, instead, for_it)
+    after = columns(more_yes * scale, more_no * scale).reshape(*shape, 2)
+    return Ballot(keep, anew.reshape(shape), after, hits.reshape(shape))
+
+
+def against(votes: Tensor, missed: Tensor) -> Tensor:
+    """Votes (..., Nx, 2) after a look that should have shown some cells' surfaces, bool (..., Nx), and did not."""
+    yes, no = votes.unbind(-1)
+    return columns(yes, no + missed.to(no))
