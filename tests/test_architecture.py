@@ -29,6 +29,7 @@ FLOORS = (
         "sgbm",
         "semiglobal",
         "costs",
+        "subpixel",
         "surfaces",
         "sweep",
         "disparity_files",

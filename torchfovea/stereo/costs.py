@@ -17,7 +17,18 @@ from torchfovea.sensing.camera import Camera, Pinhole
 from torchfovea.sensing.retina import Retina, halve
 from torchfovea.stereo.sheets import Sheet, average
 
-__all__ = ["Eye", "Looks", "acuity", "correlate", "own_values", "project", "sheet_rays", "spread"]
+__all__ = [
+    "Eye",
+    "Looks",
+    "acuity",
+    "correlate",
+    "own_values",
+    "project",
+    "read_other",
+    "read_own",
+    "sheet_rays",
+    "spread",
+]
 
 
 class Eye(NamedTuple):
@@ -178,6 +189,26 @@ def own_values(eye: Eye, sheet: Sheet, radius: int, noise: float) -> Looks:
     u, v = (c.expand(len(eye.images), 1, -1, -1) for c in sheet.px.unbind(-1))
     values = _read(eye, eye.images, u, v, sheet.width_px)
     return Looks(values, *_moments(values, sheet, radius, noise))
+
+
+def read_other(eye: Eye, sheet: Sheet, ray: Tensor, rho: Tensor) -> Tensor:
+    """What the other eye sees of points on the rays of a sheet's cells, (B, D, R, S); see `project`."""
+    u, v, _ = project(eye, ray, rho)
+    return _read(eye, eye.others, u, v, sheet.width_px)
+
+
+def read_own(eye: Eye, sheet: Sheet, ray: Tensor, step: Tensor) -> Tensor:
+    """What an eye sees behind, at and ahead of a sheet's cells, (B, 3, R, S).
+
+    Ahead is where a point is that the other eye sees beside its own, by as much as a cell's moves there if its inverse
+    depth grows by `step` (B, R, S) [1/m].
+    """
+    shift = step[..., None] * eye.t[:, None, None]
+    beside = torch.stack([ray - shift, ray + shift], 1) @ eye.R[:, None, None]
+    u, v = eye.camera.project(beside).unbind(-1)
+    own_u, own_v = (c.expand(len(ray), 1, -1, -1) for c in sheet.px.unbind(-1))
+    u, v = (torch.cat([b[:, :1], own, b[:, 1:]], 1) for b, own in ((u, own_u), (v, own_v)))
+    return _read(eye, eye.images, u, v, sheet.width_px)
 
 
 def _moments(values: Tensor, sheet: Sheet, radius: int, noise: float) -> tuple[Tensor, Tensor]:

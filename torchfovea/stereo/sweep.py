@@ -5,10 +5,7 @@ two retinas can tell apart there: an RF on the periphery is wide and needs few. 
 neighbourhood into the right image, which is read as wide as the wider of the two RFs that would see it, and is judged
 by the correlation (ZNCC) of the neighbourhoods on the cortical grid. Penalties for steps between neighbours, passed
 along rings and sectors (`torchfovea.stereo.semiglobal`), settle what single neighbourhoods cannot. The winner is then
-refined between hypotheses on neighbourhoods that follow its surface: an offset δ has the likelihood
-exp(−n (1 − z(δ))/(2 (1 − z))), with z the correlation and n the independent samples of a neighbourhood. With a parabola
-through the curve of costs the posterior's mean (the soft-argmin, whose temperature is thus the match's own noise) and
-its variance have a closed form.
+refined on neighbourhoods that follow its surface, which also tells its variance (`torchfovea.stereo.subpixel`).
 
 Nothing is rectified: the eyes may be verged, and pinholes or fisheyes. The choice of the winner is piecewise constant
 in the images; everything after it is differentiable.
@@ -45,7 +42,7 @@ class SweepRange(NamedTuple):
 
     Attributes:
         inverse_range: (..., N) [1/m] from the left eye; 0 where invalid.
-        sigma: (..., N), its standard deviation by the curve of costs alone, without the RFs' own width; 0 where
+        sigma: (..., N), its standard deviation by the images alone, without the RFs' own width; 0 where
             invalid.
         correlation: (..., N) of the neighbourhoods, up to 1; 0 where invalid.
         valid: bool (..., N).
