@@ -30,6 +30,7 @@ FLOORS = (
         "semiglobal",
         "costs",
         "subpixel",
+        "readings",
         "surfaces",
         "sweep",
         "disparity_files",

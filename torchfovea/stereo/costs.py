@@ -15,6 +15,7 @@ from torch import Tensor
 from torchfovea.gaussian import columns
 from torchfovea.sensing.camera import Camera, Pinhole
 from torchfovea.sensing.retina import Retina, halve
+from torchfovea.stereo.rig import StereoRig
 from torchfovea.stereo.sheets import Sheet, average
 
 __all__ = [
@@ -77,6 +78,28 @@ class Looks(NamedTuple):
 PLANE = 0.5
 
 
+def left_eye(
+    pair: Tensor, rig: StereoRig, camera: Camera, camera_right: Camera, retina: Retina, middle: tuple[float, float]
+) -> Eye:
+    """The left eye that looks for its RFs' likes in the right one.
+
+    Args:
+        pair: (2B, 1, H, W), all left images first; the retina spans the shorter side.
+        rig: the eyes' poses.
+        camera: the left eye's, in retinal pixels.
+        camera_right: the right eye's.
+        retina: of both.
+        middle: image pixel of both optical axes.
+    """
+    scale = min(pair.shape[-2:]) / (2 * retina.radius_px)
+    levels = acuity(pair, retina, scale, middle)
+    batch = len(pair) // 2
+    R_left, R_right = (r.to(pair).expand(batch, 3, 3) for r in (rig.R_left, rig.R_right))
+    shift = -(R_right.mT @ pair.new_tensor([rig.baseline_m, 0.0, 0.0]))
+    mine, theirs = levels[:batch], levels[batch:]
+    return Eye(camera, camera_right, R_right.mT @ R_left, shift, R_left[:, 2], mine, theirs, retina, scale, middle)
+
+
 def acuity(images: Tensor, retina: Retina, scale: float, middle: tuple[float, float]) -> Tensor:
     """Images as RFs of several widths would see them.
 
@@ -131,12 +154,24 @@ def sheet_rays(eye: Eye, px: Tensor) -> Tensor:
     axis it is half the range.
     """
     x, y, z = eye.camera.rays(px).unbind(-1)
+    ahead, length = _ahead(eye, x, y, z)
+    inverse = 1 / torch.maximum(ahead, PLANE * length)
     over = (...,) + (None,) * x.dim()
-    ahead = [a[over] for a in eye.ahead.unbind(-1)]
-    depth = ahead[0] * x + ahead[1] * y + ahead[2] * z
-    inverse = 1 / torch.maximum(depth, PLANE * (x * x + y * y + z * z).sqrt())
     x, y, z = x * inverse, y * inverse, z * inverse
     return columns(*(eye.R[:, i, 0][over] * x + eye.R[:, i, 1][over] * y + eye.R[:, i, 2][over] * z for i in range(3)))
+
+
+def sheet_depth(eye: Eye, px: Tensor) -> Tensor:
+    """Depth along the rectified frame's z axis where a sheet's depth is 1, (B, *cells), at places (*cells, 2)."""
+    ahead, length = _ahead(eye, *eye.camera.rays(px).unbind(-1))
+    return (ahead / (PLANE * length)).clamp(max=1)
+
+
+def _ahead(eye: Eye, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+    """Depths (B, *cells) and lengths (*cells) of rays in the eye's frame."""
+    over = (...,) + (None,) * x.dim()
+    ahead = [a[over] for a in eye.ahead.unbind(-1)]
+    return ahead[0] * x + ahead[1] * y + ahead[2] * z, (x * x + y * y + z * z).sqrt()
 
 
 def project(eye: Eye, ray: Tensor, rho: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -29,10 +29,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfovea.stereo.costs import Eye, read_other, read_own, sheet_rays
+from torchfovea.gaussian import columns
+from torchfovea.stereo.costs import Eye, project, read_other, read_own, sheet_rays
 from torchfovea.stereo.sheets import Sheet, average
 
-__all__ = ["Offset", "subpixel"]
+__all__ = ["Offset", "smoothed", "steps_per_width", "subpixel"]
 
 WIDE = 3  # surroundings are nine neighbourhoods, so many cells apart
 STEP = 0.5  # of the derivatives, in units
@@ -105,6 +106,31 @@ def subpixel(
     value = (near * near_weight + expected / doubt) / precision
     rest = error - value * pull + value.square() * energy / 4
     return Offset(value, 1 / precision, weight[:, 0] * (1 - (rest / (2 * ll)).clamp(min=0)))
+
+
+@torch.no_grad()
+def steps_per_width(eye: Eye, sheet: Sheet, ray: Tensor, surface: Tensor, step: Tensor) -> Tensor:
+    """How many steps of inverse depth move the match by an RF's width, at most 10, (B, R, S).
+
+    The wider of the two RFs that see the point counts.
+    """
+    u, v, _ = project(eye, ray, torch.stack([surface, surface + step], 1))
+    width = torch.maximum(eye.retina.width_px(columns(u[:, 0], v[:, 0])), sheet.width_px)
+    motion = torch.hypot(u[:, 1] - u[:, 0], v[:, 1] - v[:, 0])
+    return (width / motion.clamp(min=1e-6)).clamp(max=10)
+
+
+def smoothed(surface: Tensor, edge: Tensor, trusted: Tensor | None = None) -> Tensor:
+    """Surfaces (B, R, S) averaged with those of their eight neighbours, trusted ones, that are within `edge`."""
+    total, weight = surface.clone(), torch.ones_like(surface)
+    for i in (-1, 0, 1):
+        for j in (-1, 0, 1):
+            if i or j:
+                other = surface.roll((i, j), (-2, -1))
+                near = (other - surface).abs() <= edge
+                near = (near if trusted is None else near & trusted.roll((i, j), (-2, -1))).to(other.dtype)
+                total, weight = total + near * other, weight + near
+    return total / weight
 
 
 def _solve(sums: Tensor, samples: Tensor, floor: float) -> tuple[Tensor, Tensor]:

@@ -9,12 +9,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchfovea.gaussian import columns
 from torchfovea.setting import require
 from torchfovea.stereo.costs import Eye, correlate, own_values, project, sheet_rays, spread
 from torchfovea.stereo.semiglobal import aggregate
 from torchfovea.stereo.sheets import Sheet, nearest_rf, read_sheet
-from torchfovea.stereo.subpixel import subpixel
+from torchfovea.stereo.subpixel import smoothed, steps_per_width, subpixel
 
 __all__ = ["Estimate", "Sweep", "Winner", "match_sheet", "refine", "win"]
 
@@ -169,24 +168,11 @@ def win(eye: Eye, sheet: Sheet, params: Sweep, low: Tensor, high: Tensor) -> Win
 def refine(eye: Eye, sheet: Sheet, winner: Winner, params: Sweep) -> Estimate:
     """Winners moved to where the images agree best, on neighbourhoods that follow their surface."""
     with torch.no_grad():
-        ray, surface = sheet_rays(eye, sheet.px), _smooth(winner)
-        u, v, seen = project(eye, ray, torch.stack([surface, surface + winner.step], 1))
-        width = torch.maximum(eye.retina.width_px(columns(u[:, 0], v[:, 0])), sheet.width_px)
-        motion = torch.hypot(u[:, 1] - u[:, 0], v[:, 1] - v[:, 0])
-        unit = winner.step * (width / motion.clamp(min=1e-6)).clamp(max=10)
+        ray, surface = sheet_rays(eye, sheet.px), smoothed(winner.rho, 1.5 * winner.step)
+        unit = winner.step * steps_per_width(eye, sheet, ray, surface, winner.step)
+        seen = project(eye, ray, surface[:, None])[2]
         trusted = winner.clear & seen[:, 0] & eye.retina.inside(sheet.px)
     offset = subpixel(eye, sheet, surface, unit, trusted, params.refine_window, params.noise, params.winner_widths)
     sharp = offset.value.detach().abs() < 1
     variance = params.temperature * offset.variance
     return Estimate(surface + offset.value.clamp(-1, 1) * unit, variance * unit * unit, offset.correlation, unit, sharp)
-
-
-def _smooth(winner: Winner) -> Tensor:
-    """Winners averaged with their eight neighbours on the same surface."""
-    total, weight = torch.zeros_like(winner.rho), torch.zeros_like(winner.rho)
-    for i in (-1, 0, 1):
-        for j in (-1, 0, 1):
-            other = winner.rho.roll((i, j), (-2, -1))
-            near = ((other - winner.rho).abs() <= 1.5 * winner.step).to(other.dtype)
-            total, weight = total + near * other, weight + near
-    return total / weight

@@ -27,7 +27,7 @@ from torchfovea.sensing.correspondence import Budget, Clues, Correspondences, Di
 from torchfovea.sensing.layout import Retina
 from torchfovea.setting import require
 from torchfovea.stereo.confidence import field_clues
-from torchfovea.stereo.costs import Eye, acuity, project, sheet_rays
+from torchfovea.stereo.costs import left_eye, project, sheet_rays
 from torchfovea.stereo.rectified import RectifiedMatch
 from torchfovea.stereo.rig import StereoRig
 from torchfovea.stereo.sheets import nearest_rf, sheets
@@ -120,7 +120,7 @@ def match_sweep(
     size = min(height, width)
     budget = budget if budget.source_px is None else replace(budget, source_px=size)
     middle = ((width - 1) / 2, (height - 1) / 2) if gaze_px is None else gaze_px
-    eye = _left_eye(pair, rig, camera, camera_right or camera, retina, size / (2 * retina.radius_px), middle)
+    eye = left_eye(pair, rig, camera, camera_right or camera, retina, middle)
     left_px = retina.centers_px(pair.device, pair.dtype)
     ray = sheet_rays(eye, left_px)
     length = ray.detach().square().sum(-1).sqrt()
@@ -264,23 +264,6 @@ def _pair(left: Tensor | np.ndarray, right: Tensor | np.ndarray) -> tuple[Tensor
     require(min(shapes[0][-2:]) >= 8, "left.shape", shapes[0], "at least 8 pixels on either side")
     single = greys[0].dim() == 3
     return torch.cat([grey[None] if single else grey for grey in (greys[0], greys[1].to(greys[0]))]), single
-
-
-def _left_eye(
-    pair: Tensor,
-    rig: StereoRig,
-    camera: Camera,
-    camera_right: Camera,
-    retina: Retina,
-    scale: float,
-    middle: tuple[float, float],
-) -> Eye:
-    levels = acuity(pair, retina, scale, middle)
-    batch = len(pair) // 2
-    R_left, R_right = (r.to(pair).expand(batch, 3, 3) for r in (rig.R_left, rig.R_right))
-    shift = -(R_right.mT @ pair.new_tensor([rig.baseline_m, 0.0, 0.0]))
-    mine, theirs = levels[:batch], levels[batch:]
-    return Eye(camera, camera_right, R_right.mT @ R_left, shift, R_left[:, 2], mine, theirs, retina, scale, middle)
 
 
 def _interval(volume: Volume, retina: Retina, length: Tensor, sigmas: float) -> tuple[Tensor, Tensor]:
