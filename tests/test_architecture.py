@@ -29,6 +29,8 @@ FLOORS = (
         "sgbm",
         "semiglobal",
         "costs",
+        "subpixel",
+        "readings",
         "surfaces",
         "sweep",
         "disparity_files",

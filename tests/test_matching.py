@@ -2,20 +2,26 @@
 
 import math
 import sys
+from dataclasses import asdict
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from omegaconf import OmegaConf
 
+from torchfovea.config import conf_dir
 from torchfovea.sensing.camera import Fisheye, Pinhole, image_camera
 from torchfovea.sensing.correspondence import Budget, Disparity, eye_sigma_px
 from torchfovea.sensing.retina import LogPolar, Uniform
 from torchfovea.setting import SettingError
+from torchfovea.stereo.external import External
 from torchfovea.stereo.matching import SGBM, match_sgbm, posed, read_disparity, verged
 from torchfovea.stereo.rectified import match_disparity, match_rectified
 from torchfovea.stereo.sgbm import disparity_sgbm
+from torchfovea.stereo.sweep import Sweep
 
 BASELINE = 0.204
 SIZE = 240
@@ -127,6 +133,45 @@ def test_matches_a_plane(camera, plane, vergence, retina):
     ours = disparity.depth_m().numpy()[rows, columns]
     central = np.hypot(columns - u, rows - v) < 80
     assert np.nanmedian(np.abs(ours / depth - 1)[central]) < 0.025
+
+
+@pytest.mark.parametrize("exposure", [(1.0, 0.0), (0.7, 0.05)], ids=["alike", "darker"])
+def test_whole_pixels_draw_no_disparity(exposure):
+    """Block matching alone errs by up to 0.2 px, by the phase of the true disparity; the readings do not."""
+    plane, retina, focal = ((-0.2, 0.0, 1.0), 1.0), Uniform(12_000), PINHOLE.focal_px * SIZE / 200
+    left, right = pair(PINHOLE, 0.0, plane)
+    found, _ = match_sgbm(left, exposure[0] * right + exposure[1], verged(0.0, BASELINE), PINHOLE, retina)
+    expected, points = truth(PINHOLE, 0.0, plane, found.left_px.double().numpy())
+    error = (expected - found.right_px.double().numpy())[:, 0] * SIZE / 200
+    phase = np.floor(8 * (focal * BASELINE / points[:, 2] % 1)).astype(int)
+    near = found.valid.numpy() & (np.hypot(*found.left_px.numpy().T) < 60) & (np.hypot(*expected.T) < 95)
+    medians = [np.median(error[near & (phase == k)]) for k in range(8)]
+    assert min(np.bincount(phase[near])) > 50
+    assert np.abs(medians).max() < 0.05
+
+
+def test_the_largest_block_that_is_allowed_does_not_wrap_around():
+    """Random squares of full contrast, where wrong matches cost most."""
+    generator = np.random.default_rng(0)
+    squares = np.kron(generator.random((50, 120)) < 0.5, np.ones((2, 2))).astype(np.float32)
+    for params in (SGBM(block_px=11), SGBM(block_px=13, smooth_small=8, smooth_large=99)):
+        disparity, valid = disparity_sgbm(squares[:, :-10].copy(), squares[:, 10:].copy(), (-16, 16), params)
+        inner = np.s_[20:-20, 40:-40]
+        assert valid[inner].mean() > 0.99
+        assert np.abs(disparity[inner][valid[inner]] - 10).max() < 0.5
+
+
+def test_the_defaults_are_those_of_the_commands():
+    folder = Path(conf_dir()) / "matcher"
+    for name, params in (
+        ("sgbm", SGBM()),
+        ("sgbm_authors", SGBM.authors),
+        ("sweep", Sweep()),
+        ("external", External()),
+    ):
+        own = asdict(params)
+        told = {k: v for k, v in OmegaConf.load(folder / f"{name}.yaml").items() if k in own}
+        assert told == {k: own[k] for k in told} and len(told) > 4
 
 
 def test_float64_and_colour_and_bytes_agree():
@@ -368,6 +413,9 @@ RIG = verged(0.1, BASELINE)
         (lambda: Budget(source_px=0), "source_px = 0"),
         (lambda: Budget(match_px=-1), "match_px = -1"),
         (lambda: SGBM(block_px=4), "block_px = 4"),
+        (lambda: SGBM(block_px=29), r"block_px = 29: expected at most 5 .* \(16-bit sums\)"),
+        (lambda: SGBM(block_px=13), r"block_px = 13: expected at most 11 with prefilter_cap = 63 .* = 5408"),
+        (lambda: SGBM(block_px=15, smooth_small=8, smooth_large=99), r"block_px = 15: expected at most 13"),
         (lambda: SGBM(smooth_small=9, smooth_large=9), "smooth_large = 9"),
         (lambda: SGBM(prefilter_cap=64), "prefilter_cap = 64"),
         (lambda: SGBM(uniqueness_percent=100), "uniqueness_percent = 100"),

@@ -15,9 +15,21 @@ from torch import Tensor
 from torchfovea.gaussian import columns
 from torchfovea.sensing.camera import Camera, Pinhole
 from torchfovea.sensing.retina import Retina, halve
+from torchfovea.stereo.rig import StereoRig
 from torchfovea.stereo.sheets import Sheet, average
 
-__all__ = ["Eye", "Looks", "acuity", "correlate", "own_values", "project", "sheet_rays", "spread"]
+__all__ = [
+    "Eye",
+    "Looks",
+    "acuity",
+    "correlate",
+    "own_values",
+    "project",
+    "read_other",
+    "read_own",
+    "sheet_rays",
+    "spread",
+]
 
 
 class Eye(NamedTuple):
@@ -64,6 +76,28 @@ class Looks(NamedTuple):
 
 # planes beyond this depth per range (60 degrees from the axis) are spheres: a wide view's rim sees walls face on
 PLANE = 0.5
+
+
+def left_eye(
+    pair: Tensor, rig: StereoRig, camera: Camera, camera_right: Camera, retina: Retina, middle: tuple[float, float]
+) -> Eye:
+    """The left eye that looks for its RFs' likes in the right one.
+
+    Args:
+        pair: (2B, 1, H, W), all left images first; the retina spans the shorter side.
+        rig: the eyes' poses.
+        camera: the left eye's, in retinal pixels.
+        camera_right: the right eye's.
+        retina: of both.
+        middle: image pixel of both optical axes.
+    """
+    scale = min(pair.shape[-2:]) / (2 * retina.radius_px)
+    levels = acuity(pair, retina, scale, middle)
+    batch = len(pair) // 2
+    R_left, R_right = (r.to(pair).expand(batch, 3, 3) for r in (rig.R_left, rig.R_right))
+    shift = -(R_right.mT @ pair.new_tensor([rig.baseline_m, 0.0, 0.0]))
+    mine, theirs = levels[:batch], levels[batch:]
+    return Eye(camera, camera_right, R_right.mT @ R_left, shift, R_left[:, 2], mine, theirs, retina, scale, middle)
 
 
 def acuity(images: Tensor, retina: Retina, scale: float, middle: tuple[float, float]) -> Tensor:
@@ -120,12 +154,24 @@ def sheet_rays(eye: Eye, px: Tensor) -> Tensor:
     axis it is half the range.
     """
     x, y, z = eye.camera.rays(px).unbind(-1)
+    ahead, length = _ahead(eye, x, y, z)
+    inverse = 1 / torch.maximum(ahead, PLANE * length)
     over = (...,) + (None,) * x.dim()
-    ahead = [a[over] for a in eye.ahead.unbind(-1)]
-    depth = ahead[0] * x + ahead[1] * y + ahead[2] * z
-    inverse = 1 / torch.maximum(depth, PLANE * (x * x + y * y + z * z).sqrt())
     x, y, z = x * inverse, y * inverse, z * inverse
     return columns(*(eye.R[:, i, 0][over] * x + eye.R[:, i, 1][over] * y + eye.R[:, i, 2][over] * z for i in range(3)))
+
+
+def sheet_depth(eye: Eye, px: Tensor) -> Tensor:
+    """Depth along the rectified frame's z axis where a sheet's depth is 1, (B, *cells), at places (*cells, 2)."""
+    ahead, length = _ahead(eye, *eye.camera.rays(px).unbind(-1))
+    return (ahead / (PLANE * length)).clamp(max=1)
+
+
+def _ahead(eye: Eye, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+    """Depths (B, *cells) and lengths (*cells) of rays in the eye's frame."""
+    over = (...,) + (None,) * x.dim()
+    ahead = [a[over] for a in eye.ahead.unbind(-1)]
+    return ahead[0] * x + ahead[1] * y + ahead[2] * z, (x * x + y * y + z * z).sqrt()
 
 
 def project(eye: Eye, ray: Tensor, rho: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -178,6 +224,26 @@ def own_values(eye: Eye, sheet: Sheet, radius: int, noise: float) -> Looks:
     u, v = (c.expand(len(eye.images), 1, -1, -1) for c in sheet.px.unbind(-1))
     values = _read(eye, eye.images, u, v, sheet.width_px)
     return Looks(values, *_moments(values, sheet, radius, noise))
+
+
+def read_other(eye: Eye, sheet: Sheet, ray: Tensor, rho: Tensor) -> Tensor:
+    """What the other eye sees of points on the rays of a sheet's cells, (B, D, R, S); see `project`."""
+    u, v, _ = project(eye, ray, rho)
+    return _read(eye, eye.others, u, v, sheet.width_px)
+
+
+def read_own(eye: Eye, sheet: Sheet, ray: Tensor, step: Tensor) -> Tensor:
+    """What an eye sees behind, at and ahead of a sheet's cells, (B, 3, R, S).
+
+    Ahead is where a point is that the other eye sees beside its own, by as much as a cell's moves there if its inverse
+    depth grows by `step` (B, R, S) [1/m].
+    """
+    shift = step[..., None] * eye.t[:, None, None]
+    beside = torch.stack([ray - shift, ray + shift], 1) @ eye.R[:, None, None]
+    u, v = eye.camera.project(beside).unbind(-1)
+    own_u, own_v = (c.expand(len(ray), 1, -1, -1) for c in sheet.px.unbind(-1))
+    u, v = (torch.cat([b[:, :1], own, b[:, 1:]], 1) for b, own in ((u, own_u), (v, own_v)))
+    return _read(eye, eye.images, u, v, sheet.width_px)
 
 
 def _moments(values: Tensor, sheet: Sheet, radius: int, noise: float) -> tuple[Tensor, Tensor]:

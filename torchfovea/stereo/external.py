@@ -26,8 +26,10 @@ from torchfovea.sensing.correspondence import Budget, Correspondences, Disparity
 from torchfovea.sensing.retina import Retina, fovea, interpolate
 from torchfovea.setting import SettingError, require
 from torchfovea.stereo.confidence import read_clues
+from torchfovea.stereo.costs import left_eye
 from torchfovea.stereo.disparity_files import check_maps, load_disparity
 from torchfovea.stereo.matching import check_range, correspondences, in_range, read_disparity
+from torchfovea.stereo.readings import refine_reading
 from torchfovea.stereo.rectified import RectifiedMatch, match_disparity
 from torchfovea.stereo.rig import StereoRig
 
@@ -48,6 +50,8 @@ class External:
         least_confidence: less is invalid.
         edge_px: neighbouring disparities further apart than this are different surfaces, never averaged.
         rectified_fov_deg: widest rectified view of verged eyes; what lies beyond is masked.
+        refine: let the images move what is read at the RFs by the last part of a pixel, as the other matchers do; for
+            matchers that prefer whole pixels. Either way they tell its noise.
     """
 
     sure_px: float = 0.0
@@ -56,6 +60,7 @@ class External:
     least_confidence: float = 0.0
     edge_px: float = 1.0
     rectified_fov_deg: float = 140.0
+    refine: bool = False
 
     def __post_init__(self) -> None:
         """Raise SettingError for impossible numbers."""
@@ -122,6 +127,11 @@ def _colour_pair(left: Tensor | np.ndarray, right: Tensor | np.ndarray) -> Tenso
     return torch.stack([out[0], out[1].to(out[0])])
 
 
+def _grey(pair: Tensor) -> Tensor:
+    """(2, 3, H, W) to (2, 1, H, W), as `torchfovea.stereo.matching.grey_pair`."""
+    return (pair * pair.new_tensor([0.299, 0.587, 0.114])[:, None, None]).sum(1, keepdim=True)
+
+
 def match_external_rectified(
     source: str | Path | Matcher,
     left: Tensor | np.ndarray,
@@ -180,6 +190,8 @@ def match_external_rectified(
         nearest_range_m=nearest_range_m,
         farthest_range_m=farthest_range_m,
         edge_px=params.edge_px,
+        pair=_grey(pair),
+        move=params.refine,
     )
     scale = camera_left.focal_px / match.camera_left.focal_px
     left_px = match.correspondences.left_px
@@ -254,14 +266,26 @@ def match_external(
         trusted &= (confidence >= params.least_confidence).to(pair.device)
     disparity = torch.where(trusted, disparity, torch.zeros_like(disparity))
     field = Disparity(views[0].mean(0), disparity, trusted, view, 0.0, rig.baseline_m)
+
+    def read(px: Tensor) -> tuple[Tensor, Tensor]:
+        directions = camera.rays(px) @ R_left.mT
+        x, y, z = directions.unbind(-1)
+        shift, found = read_disparity(field, view.project(directions), params.edge_px)
+        return shift, found & (z > 0) & (x.abs() <= limit * z) & (y.abs() <= limit * z)
+
     place = view.project(directions)
-    shift, found = read_disparity(field, place, params.edge_px)
-    found &= inside & in_range(shift, focal * rig.baseline_m, nearest_range_m, farthest_range_m)
+    shift, found = read(left_px)
+    reach = focal * rig.baseline_m
+    eye = left_eye(_grey(pair), rig, camera, camera, retina, ((pair.shape[-1] - 1) / 2, (pair.shape[-2] - 1) / 2))
+    reading = refine_reading(eye, read, shift, found, reach, params.edge_px, params.refine)
+    shift = reading.shift_px
+    found &= in_range(shift, reach, nearest_range_m, farthest_range_m)
     there = view.rays(columns(place[..., 0] - shift, place[..., 1])) @ R_right
     right_px = camera.project(there)
     found &= camera.in_view(there) & retina.inside(right_px)
     scale = size / (2 * retina.radius_px)
     clues = read_clues(field, place, shift, retina.width_px(left_px) * scale)
+    clues = clues._replace(noise_px=reading.noise_px, mismatch=reading.mismatch)
     matches = correspondences(left_px, right_px, found, retina, budget, clues)
     return _doubt(matches, confidence, place, scale, params, budget.claim), field._replace(clues=clues)
 

@@ -20,6 +20,8 @@ from torchfovea.sensing.correspondence import Budget, Clues, Correspondences, Di
 from torchfovea.sensing.retina import Retina, fovea, interpolate
 from torchfovea.setting import require
 from torchfovea.stereo.confidence import read_clues
+from torchfovea.stereo.costs import left_eye
+from torchfovea.stereo.readings import refine_reading
 from torchfovea.stereo.rig import StereoRig, posed, verged
 from torchfovea.stereo.sgbm import SGBM, disparity_sgbm
 
@@ -94,13 +96,21 @@ def match_sgbm(
     views = [interpolate(values[i : i + 1], retina, px)[0, 0] for i, px in enumerate(seen)]
     disparity = dense_disparity(views, search, params, view, 0.0, rig.baseline_m, pad=False)
 
+    def read(px: Tensor) -> tuple[Tensor, Tensor]:
+        directions = camera.rays(px) @ R_left.mT
+        x, y, z = directions.unbind(-1)
+        shift, found = read_disparity(disparity, view.project(directions), params.edge_px)
+        return shift, found & view.in_view(directions) & (x.abs() <= limit * z) & (y.abs() <= limit * z)
+
     left_px = retina.centers_px(pair.device, pair.dtype)
-    directions = camera.rays(left_px) @ R_left.mT
-    place = view.project(directions)
-    x, y, z = directions.unbind(-1)
-    inside = view.in_view(directions) & (x.abs() <= limit * z) & (y.abs() <= limit * z)
-    shift, found = read_disparity(disparity, place, params.edge_px)
-    found &= inside & in_range(shift, focal * rig.baseline_m, nearest_range_m, farthest_range_m)
+    place = view.project(camera.rays(left_px) @ R_left.mT)
+    shift, found = read(left_px)
+    reach = focal * rig.baseline_m
+    middle = ((pair.shape[-1] - 1) / 2, (pair.shape[-2] - 1) / 2)
+    eye = left_eye(pair, rig, camera, camera, retina, middle)
+    reading = refine_reading(eye, read, shift, found, reach, params.edge_px)
+    shift = reading.shift_px
+    found &= in_range(shift, reach, nearest_range_m, farthest_range_m)
     there = view.rays(columns(place[..., 0] - shift, place[..., 1])) @ R_right
     right_px = camera.project(there)
     found &= camera.in_view(there) & retina.inside(right_px)
@@ -108,6 +118,7 @@ def match_sgbm(
     looks = retina.inside(seen[0]) & camera.in_view(rays @ R_left)
     disparity = disparity._replace(image=disparity.image * looks, valid=disparity.valid & looks)
     clues = read_clues(disparity, place, shift, retina.width_px(left_px) * (size / (2 * retina.radius_px)))
+    clues = clues._replace(noise_px=reading.noise_px, mismatch=reading.mismatch)
     return correspondences(left_px, right_px, found, retina, budget, clues), disparity._replace(clues=clues)
 
 

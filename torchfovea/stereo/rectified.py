@@ -19,6 +19,7 @@ from torchfovea.sensing.correspondence import Budget, Correspondences, Disparity
 from torchfovea.sensing.retina import Retina, fovea, interpolate
 from torchfovea.setting import require
 from torchfovea.stereo.confidence import read_clues
+from torchfovea.stereo.costs import left_eye
 from torchfovea.stereo.matching import (
     check_range,
     correspondences,
@@ -27,6 +28,8 @@ from torchfovea.stereo.matching import (
     in_range,
     read_disparity,
 )
+from torchfovea.stereo.readings import refine_reading
+from torchfovea.stereo.rig import StereoRig
 from torchfovea.stereo.sgbm import SGBM
 
 __all__ = ["RectifiedMatch", "match_disparity", "match_rectified"]
@@ -105,6 +108,7 @@ def match_rectified(
         nearest_range_m=nearest_range_m,
         farthest_range_m=farthest_range_m,
         edge_px=params.edge_px,
+        pair=pair,
     )
     return found._replace(disparity=disparity._replace(clues=found.disparity.clues))
 
@@ -121,6 +125,8 @@ def match_disparity(
     nearest_range_m: float = 0.3,
     farthest_range_m: float = math.inf,
     edge_px: float = 1.0,
+    pair: Tensor | None = None,
+    move: bool = True,
 ) -> RectifiedMatch:
     """Correspondences from a disparity map of any origin: a file, a learned matcher, the truth.
 
@@ -136,6 +142,8 @@ def match_disparity(
         nearest_range_m: nearest depth that is believed.
         farthest_range_m: farthest depth that is believed.
         edge_px: neighbouring disparities further apart than this are different surfaces, never averaged.
+        pair: (2, 1, H, W), both images in grey, to refine the readings of a retina on; None: read only.
+        move: whether the images may move a reading, or only say how well they bear it out.
 
     Returns:
         As `match_rectified`; the image of the returned disparity is black.
@@ -167,19 +175,34 @@ def match_disparity(
         budget = budget if budget.source_px is None else replace(budget, source_px=min(height, width))
     place = left_px * scale + left_px.new_tensor([u0, v0])
     field = Disparity(torch.zeros_like(values), values, trusted, camera_left, doffs, baseline_m)
-    shift, found = read_disparity(field, place, edge_px)
-    found &= in_range(shift + doffs, camera_left.focal_px * baseline_m, nearest_range_m, farthest_range_m)
+
+    def read(px: Tensor) -> tuple[Tensor, Tensor]:
+        shift, found = read_disparity(field, px * scale + px.new_tensor([u0, v0]), edge_px)
+        return shift + doffs, found
+
+    cameras = [
+        Pinhole(camera.focal_px / scale, (camera.cx_px - u0) / scale, (camera.cy_px - v0) / scale)
+        for camera in (camera_left, camera_right)
+    ]
+    reach = camera_left.focal_px * baseline_m
+    shift, found = read(left_px)
+    reading = None
+    if retina is not None and pair is not None:
+        same = torch.eye(3, dtype=torch.float64)
+        eye = left_eye(pair, StereoRig(same, same, baseline_m), cameras[0], cameras[1], retina, (u0, v0))
+        reading = refine_reading(eye, read, shift, found, reach, edge_px, move)
+        shift = reading.shift_px
+    found &= in_range(shift, reach, nearest_range_m, farthest_range_m)
+    shift = shift - doffs
     right_x = place[:, 0] - shift
     found &= (right_x >= -0.5) & (right_x <= width - 0.5)
     right_px = columns(left_px[:, 0] - shift / scale, left_px[:, 1])
     if retina is not None:
         found &= retina.inside(right_px)
-    cameras = [
-        Pinhole(camera.focal_px / scale, (camera.cx_px - u0) / scale, (camera.cy_px - v0) / scale)
-        for camera in (camera_left, camera_right)
-    ]
     width_px = torch.ones_like(shift) if retina is None else retina.width_px(left_px) * scale
     clues = read_clues(field, place, shift, width_px)
+    if reading is not None:
+        clues = clues._replace(noise_px=reading.noise_px, mismatch=reading.mismatch)
     matches = correspondences(left_px, right_px, found, retina, budget, clues)
     return RectifiedMatch(matches, cameras[0], cameras[1], field._replace(clues=clues))
 

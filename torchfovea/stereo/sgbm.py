@@ -44,8 +44,8 @@ class SGBM:
     block_px: int = 5
     smooth_small: int | None = None
     smooth_large: int | None = None
-    prefilter_cap: int = 31
-    uniqueness_percent: int = 10
+    prefilter_cap: int = 63
+    uniqueness_percent: int = 5
     left_right_px: int = 1
     speckle_px: int = 50
     speckle_range_px: int = 2
@@ -60,11 +60,16 @@ class SGBM:
 
     def __post_init__(self) -> None:
         """Raise SettingError for what the matcher cannot run with."""
-        odd = 1 <= self.block_px <= 51 and self.block_px % 2 == 1
-        require(odd, "matcher.block_px", self.block_px, "an odd number of pixels, 1 to 51")
+        odd = self.block_px >= 1 and self.block_px % 2 == 1
+        require(odd, "matcher.block_px", self.block_px, "an odd number of pixels")
         small, large = self.penalties
         require(0 < small < large, "matcher.smooth_large", large, f"more than smooth_small = {small} > 0")
         require(1 <= self.prefilter_cap <= 63, "matcher.prefilter_cap", self.prefilter_cap, "1 to 63 grey levels")
+        # a pixel costs at most twice the cap, for its gradient, and a quarter of its grey level; OpenCV adds a block of
+        # them to P2 in 16 bits, and beyond these wraps around: the worst match becomes the best
+        most = math.isqrt(max(0, (2**15 - 1 - large) // (2 * max(self.prefilter_cap | 1, 15) + 63)))
+        fits = f"at most {most - 1 + most % 2} with prefilter_cap = {self.prefilter_cap} and smooth_large = {large}"
+        require(self.block_px <= most, "matcher.block_px", self.block_px, fits + " (16-bit sums)")
         percent = self.uniqueness_percent
         require(0 <= percent < 100, "matcher.uniqueness_percent", percent, "0 to less than 100")
         require(self.speckle_px >= 0, "matcher.speckle_px", self.speckle_px, "0 or more pixels")

@@ -9,16 +9,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchfovea.gaussian import columns
 from torchfovea.setting import require
 from torchfovea.stereo.costs import Eye, correlate, own_values, project, sheet_rays, spread
 from torchfovea.stereo.semiglobal import aggregate
 from torchfovea.stereo.sheets import Sheet, nearest_rf, read_sheet
+from torchfovea.stereo.subpixel import smoothed, steps_per_width, subpixel
 
 __all__ = ["Estimate", "Sweep", "Winner", "match_sheet", "refine", "win"]
 
 CHUNK = 100_000  # cells times hypotheses handled at once, so that they stay in the cache
-INDEPENDENT = (9.0, (81 / 19) ** 2, (729 / 141) ** 2)  # (Σw)²/Σw² of the neighbourhoods' weights
 
 
 @dataclass(frozen=True)
@@ -38,9 +37,9 @@ class Sweep:
         correlation: least correlation of a match.
         left_right_widths: RFs that claim one place of the right eye must agree to within so many RF widths with the
             best of them; infinite: unchecked.
-        winner_widths: standard deviation of the winner before its refinement, in RF widths; what is known of a match
-            where the curve of costs is flat.
-        temperature: scales the variance that the curve of costs gives.
+        winner_widths: standard deviation of a surface's refinements about their surroundings', in RF widths; what is
+            known of a match without texture is what is known of its surroundings.
+        temperature: scales the variance that the images give.
         volume_sigmas: half the depth of a volume of interest, in standard deviations.
     """
 
@@ -167,38 +166,13 @@ def win(eye: Eye, sheet: Sheet, params: Sweep, low: Tensor, high: Tensor) -> Win
 
 
 def refine(eye: Eye, sheet: Sheet, winner: Winner, params: Sweep) -> Estimate:
-    """The minimum of the curve of costs about the winners, on neighbourhoods that follow their surface."""
+    """Winners moved to where the images agree best, on neighbourhoods that follow their surface."""
     with torch.no_grad():
-        ray, surface = sheet_rays(eye, sheet.px), _smooth(winner)
-        u, v, _ = project(eye, ray, torch.stack([surface, surface + winner.step], 1))
-        width = torch.maximum(eye.retina.width_px(columns(u[:, 0], v[:, 0])), sheet.width_px)
-        motion = torch.hypot(u[:, 1] - u[:, 0], v[:, 1] - v[:, 0])
-        unit = winner.step * (width / motion.clamp(min=1e-6)).clamp(max=10)
-    own = own_values(eye, sheet, params.refine_window, params.noise)
-    offset = torch.linspace(-1, 1, 5, device=unit.device, dtype=unit.dtype)[:, None, None]
-    tried = surface[:, None] + offset * unit[:, None]
-    cost = 1 - correlate(eye, sheet, own, ray, tried, params.refine_window, params.noise)[0]
-    # the least-squares parabola
-    square = offset.square() - offset.square().mean()
-    slope = (offset * cost).sum(1) / offset.square().sum()
-    bend = 2 * (square * cost).sum(1) / square.square().sum()
-    least = (cost.mean(1) - offset.square().mean() * bend / 2).clamp(min=1e-3)
-    # samples of a neighbourhood by its weights; RFs overlap, which makes about half of them independent
-    independent = INDEPENDENT[params.refine_window - 1] / 2
-    evidence = independent / (2 * params.temperature * least)
-    # the winner itself is known to about `winner_widths`, where the curve says nothing
-    precision = evidence * bend.clamp(min=0) + params.winner_widths**-2
-    best = -evidence * slope / precision
-    sharp = best.detach().abs() < 1
-    return Estimate(surface + best.clamp(-1, 1) * unit, unit * unit / precision, 1 - least, unit, sharp)
-
-
-def _smooth(winner: Winner) -> Tensor:
-    """Winners averaged with their eight neighbours on the same surface."""
-    total, weight = torch.zeros_like(winner.rho), torch.zeros_like(winner.rho)
-    for i in (-1, 0, 1):
-        for j in (-1, 0, 1):
-            other = winner.rho.roll((i, j), (-2, -1))
-            near = ((other - winner.rho).abs() <= 1.5 * winner.step).to(other.dtype)
-            total, weight = total + near * other, weight + near
-    return total / weight
+        ray, surface = sheet_rays(eye, sheet.px), smoothed(winner.rho, 1.5 * winner.step)
+        unit = winner.step * steps_per_width(eye, sheet, ray, surface, winner.step)
+        seen = project(eye, ray, surface[:, None])[2]
+        trusted = winner.clear & seen[:, 0] & eye.retina.inside(sheet.px)
+    offset = subpixel(eye, sheet, surface, unit, trusted, params.refine_window, params.noise, params.winner_widths)
+    sharp = offset.value.detach().abs() < 1
+    variance = params.temperature * offset.variance
+    return Estimate(surface + offset.value.clamp(-1, 1) * unit, variance * unit * unit, offset.correlation, unit, sharp)

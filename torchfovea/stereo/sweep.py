@@ -5,10 +5,7 @@ two retinas can tell apart there: an RF on the periphery is wide and needs few. 
 neighbourhood into the right image, which is read as wide as the wider of the two RFs that would see it, and is judged
 by the correlation (ZNCC) of the neighbourhoods on the cortical grid. Penalties for steps between neighbours, passed
 along rings and sectors (`torchfovea.stereo.semiglobal`), settle what single neighbourhoods cannot. The winner is then
-refined between hypotheses on neighbourhoods that follow its surface: an offset δ has the likelihood
-exp(−n (1 − z(δ))/(2 (1 − z))), with z the correlation and n the independent samples of a neighbourhood. With a parabola
-through the curve of costs the posterior's mean (the soft-argmin, whose temperature is thus the match's own noise) and
-its variance have a closed form.
+refined on neighbourhoods that follow its surface, which also tells its variance (`torchfovea.stereo.subpixel`).
 
 Nothing is rectified: the eyes may be verged, and pinholes or fisheyes. The choice of the winner is piecewise constant
 in the images; everything after it is differentiable.
@@ -30,7 +27,7 @@ from torchfovea.sensing.correspondence import Budget, Clues, Correspondences, Di
 from torchfovea.sensing.layout import Retina
 from torchfovea.setting import require
 from torchfovea.stereo.confidence import field_clues
-from torchfovea.stereo.costs import Eye, acuity, project, sheet_rays
+from torchfovea.stereo.costs import left_eye, project, sheet_rays
 from torchfovea.stereo.rectified import RectifiedMatch
 from torchfovea.stereo.rig import StereoRig
 from torchfovea.stereo.sheets import nearest_rf, sheets
@@ -45,7 +42,7 @@ class SweepRange(NamedTuple):
 
     Attributes:
         inverse_range: (..., N) [1/m] from the left eye; 0 where invalid.
-        sigma: (..., N), its standard deviation by the curve of costs alone, without the RFs' own width; 0 where
+        sigma: (..., N), its standard deviation by the images alone, without the RFs' own width; 0 where
             invalid.
         correlation: (..., N) of the neighbourhoods, up to 1; 0 where invalid.
         valid: bool (..., N).
@@ -123,7 +120,7 @@ def match_sweep(
     size = min(height, width)
     budget = budget if budget.source_px is None else replace(budget, source_px=size)
     middle = ((width - 1) / 2, (height - 1) / 2) if gaze_px is None else gaze_px
-    eye = _left_eye(pair, rig, camera, camera_right or camera, retina, size / (2 * retina.radius_px), middle)
+    eye = left_eye(pair, rig, camera, camera_right or camera, retina, middle)
     left_px = retina.centers_px(pair.device, pair.dtype)
     ray = sheet_rays(eye, left_px)
     length = ray.detach().square().sum(-1).sqrt()
@@ -267,23 +264,6 @@ def _pair(left: Tensor | np.ndarray, right: Tensor | np.ndarray) -> tuple[Tensor
     require(min(shapes[0][-2:]) >= 8, "left.shape", shapes[0], "at least 8 pixels on either side")
     single = greys[0].dim() == 3
     return torch.cat([grey[None] if single else grey for grey in (greys[0], greys[1].to(greys[0]))]), single
-
-
-def _left_eye(
-    pair: Tensor,
-    rig: StereoRig,
-    camera: Camera,
-    camera_right: Camera,
-    retina: Retina,
-    scale: float,
-    middle: tuple[float, float],
-) -> Eye:
-    levels = acuity(pair, retina, scale, middle)
-    batch = len(pair) // 2
-    R_left, R_right = (r.to(pair).expand(batch, 3, 3) for r in (rig.R_left, rig.R_right))
-    shift = -(R_right.mT @ pair.new_tensor([rig.baseline_m, 0.0, 0.0]))
-    mine, theirs = levels[:batch], levels[batch:]
-    return Eye(camera, camera_right, R_right.mT @ R_left, shift, R_left[:, 2], mine, theirs, retina, scale, middle)
 
 
 def _interval(volume: Volume, retina: Retina, length: Tensor, sigmas: float) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,82 @@
+"""A disparity map, read at the receptive fields (RFs) and refined there on the two images themselves.
+
+Block matching prefers whole pixels, and it matches what the retina left of the pictures after interpolating them twice.
+The refinement (`torchfovea.stereo.subpixel`) reads the pictures as wide as each RF sees them. Not differentiable.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchfovea.stereo.costs import Eye, sheet_depth, sheet_rays
+from torchfovea.stereo.sheets import read_sheet, sheets
+from torchfovea.stereo.subpixel import smoothed, steps_per_width, subpixel
+
+__all__ = ["RADIUS", "Reading", "refine_reading"]
+
+RADIUS = 2  # of the neighbourhoods, in RFs
+NOISE = 0.004  # of either image, at least: a grey level of 255
+SMOOTH = 0.2  # of one surface's offsets about their surroundings', in widths
+
+
+class Reading(NamedTuple):
+    """At N RFs.
+
+    Attributes:
+        shift_px: disparity as it was read, (N,) [px], `doffs` included.
+        noise_px: standard deviation that the images leave it [px]; infinite nowhere.
+        mismatch: 1 less the correlation of the neighbourhoods.
+    """
+
+    shift_px: Tensor
+    noise_px: Tensor
+    mismatch: Tensor
+
+
+@torch.no_grad()
+def refine_reading(
+    eye: Eye,
+    read: Callable[[Tensor], tuple[Tensor, Tensor]],
+    shift_px: Tensor,
+    found: Tensor,
+    reach_px_m: float,
+    edge_px: float,
+    move: bool = True,
+) -> Reading:
+    """Refine what was read at the RFs.
+
+    Args:
+        eye: the left one, with both images (B = 1).
+        read: from places (..., 2) of the left eye [retinal px] to disparities with `doffs` (...) [px of the map], and
+            whether there is one.
+        shift_px: (N,), what it tells of the RFs.
+        found: bool (N,).
+        reach_px_m: focal length times baseline: disparity = reach/depth.
+        edge_px: neighbouring disparities further apart than this are different surfaces.
+        move: whether to take the refined disparities, or only what the images say of those that were read.
+    """
+    shift, noise, mismatch = shift_px.clone(), torch.zeros_like(shift_px), torch.zeros_like(shift_px)
+    for sheet in sheets(eye.retina, 1 / eye.scale, shift_px.device, shift_px.dtype):
+        ray = sheet_rays(eye, sheet.px)
+        depth = sheet_depth(eye, sheet.px)[0]
+        there, trusted = read(sheet.px.flatten(0, -2))
+        there, trusted = there.reshape(depth.shape), trusted.reshape(depth.shape)[None]
+        edge = torch.full_like(depth, edge_px)[None]
+        level = smoothed(there[None], edge, trusted)
+        step = (depth / reach_px_m)[None].clamp(min=1e-9)  # sheets count inverse depth as their rays do
+        width_px = steps_per_width(eye, sheet, ray, level * step, step)
+        offset = subpixel(eye, sheet, level * step, width_px * step, trusted, RADIUS, NOISE, SMOOTH)
+        value = torch.where(offset.value.abs() < 1, offset.value, torch.zeros_like(level))
+        by = level - there + value * width_px
+        values = torch.stack([by, offset.variance.sqrt() * width_px, 1 - offset.correlation], 1)
+        (by, sigma, rest), told = (x[0] for x in read_sheet(sheet, values, there[None], trusted, edge))
+        told = told & found[sheet.rf]
+        if move:
+            shift[sheet.rf] += torch.where(told, by, torch.zeros_like(by))
+        noise[sheet.rf] = torch.where(told, sigma, edge_px)
+        mismatch[sheet.rf] = torch.where(told, rest, torch.ones_like(rest))
+    return Reading(shift, noise * found, mismatch * found)
