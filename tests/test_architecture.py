@@ -54,6 +54,8 @@ FLOORS = (
         "reward",
         "metrics",
         "calibration",
+        "fitting",
+        "shared_errors",
         "characterization",
         "propagation",
         "plane",

@@ -111,13 +111,13 @@ class Budget:
 
     An error is N(0, σ²) with probability p and anything that was searched with 1 − p. Per eye and axis
 
-        σ² = (s W)² + (s p)² + (m p)²,   m² = match_px² + (bend b)² + (gap g)² + (noise n)²,
+        σ² = (s W)² + (s p)² + (m p)²,   m² = match_px² + (bend b)² + (gap g)² + (fringe f)² + (noise n)²,
 
     with s = `sigma_over_width`, W the RF's width, p the size of a source pixel on the retina (an RF cannot be sharper
-    than its source), m the matcher's own error and b, g, n its `Clues` where it gives any. The odds of an outlier are
+    than its source), m the matcher's own error and b, g, f, n its `Clues` where it gives any. The odds of an outlier:
 
-        (1 − p)/p = outliers/(1 − outliers) · (1 + b)^outliers_bend · (1 + g)^outliers_gap · (1 + h)^outliers_hidden ·
-        e^(outliers_mismatch c),
+        (1 − p)/p = outliers/(1 − outliers) · (1 + b)^outliers_bend · (1 + g)^outliers_gap · (1 + f)^outliers_fringe ·
+        (1 + h)^outliers_hidden · e^(outliers_mismatch c),
 
     with the clues h = hidden_px and c = mismatch. The paper has the first term only: `Budget.printed`. `torchfovea
     calibrate` fits the numbers (`torchfovea.studies.fitting`).
@@ -128,17 +128,19 @@ class Budget:
         match_px: the matcher's error in each eye on a smooth surface [source px].
         bend: share of a reading's `Clues.bend_px` that is error; 0: not asked.
         gap: share of `Clues.gap_px`; 0: not asked.
+        fringe: share of `Clues.fringe_px`; 0: not asked.
         noise: factor on `Clues.noise_px`, which the pair's own noise and texture bound; 0: not asked.
         claim: factor on the standard deviation that a matcher itself claims (the sweep's curve of costs, a foreign
             matcher's confidence).
         outliers: share of outliers where no clue speaks; 0: every correspondence is certain.
         outliers_bend: exponent of the odds.
         outliers_gap: likewise.
+        outliers_fringe: likewise.
         outliers_hidden: likewise.
         outliers_mismatch: rate of the odds' growth.
         shared: share of a match's variance that neighbouring fields of one look have in common, because they see the
-            same pixels of the same surface; 0: independent, as in the paper. It fades with the distance of the fields,
-            with a length of `max(shared_px source pixels, shared_widths widths)`.
+            same pixels of the same surface; 0: independent, as in the paper. It fades with the fields' distance d as
+            e^(−d/L), L = max(shared_px source pixels, shared_widths widths).
         shared_px: see `shared` [source px].
         shared_widths: see `shared` [widths of the receptive field].
         lasting: share of the variance that another look at the same patch of surface has in common with this one; 0:
@@ -150,11 +152,13 @@ class Budget:
     match_px: float = 0.15
     bend: float = 0.0
     gap: float = 0.0
+    fringe: float = 0.0
     noise: float = 0.0
     claim: float = 1.0
     outliers: float = 0.0
     outliers_bend: float = 0.0
     outliers_gap: float = 0.0
+    outliers_fringe: float = 0.0
     outliers_hidden: float = 0.0
     outliers_mismatch: float = 0.0
     shared: float = 0.0
@@ -208,8 +212,14 @@ def eye_sigma_px(budget: Budget, retina: Retina, px: Tensor, clues: Clues | None
 
 def doubt(budget: Budget, clues: Clues) -> Tensor:
     """The variance that the clues (...) add in each eye [source px²]. Differentiable."""
-    square = (budget.bend * clues.bend_px).square() + (budget.gap * clues.gap_px).square()
-    return square if clues.noise_px is None else square + (budget.noise * clues.noise_px).square()
+    parts = (
+        (budget.bend, clues.bend_px), (budget.gap, clues.gap_px), (budget.fringe, clues.fringe_px),
+        (budget.noise, clues.noise_px),
+    )  # fmt: skip
+    square = torch.zeros_like(clues.bend_px)
+    for factor, clue in parts:
+        square = square if clue is None else square + (factor * clue).square()
+    return square
 
 
 def inlier_share(budget: Budget, clues: Clues) -> Tensor:
@@ -217,12 +227,16 @@ def inlier_share(budget: Budget, clues: Clues) -> Tensor:
 
     Differentiable.
     """
-    odds = (1 + clues.bend_px) ** budget.outliers_bend * (1 + clues.gap_px) ** budget.outliers_gap
-    if clues.hidden_px is not None:
-        odds = odds * (1 + clues.hidden_px) ** budget.outliers_hidden
+    parts = (
+        (budget.outliers_bend, clues.bend_px), (budget.outliers_gap, clues.gap_px),
+        (budget.outliers_fringe, clues.fringe_px), (budget.outliers_hidden, clues.hidden_px),
+    )  # fmt: skip
+    odds = torch.full_like(clues.bend_px, budget.outliers / (1 - budget.outliers))
+    for power, clue in parts:
+        odds = odds if clue is None else odds * (1 + clue) ** power
     if clues.mismatch is not None:
         odds = odds * (budget.outliers_mismatch * clues.mismatch).exp()
-    return 1 / (1 + budget.outliers / (1 - budget.outliers) * odds)
+    return 1 / (1 + odds)
 
 
 def once_a_pixel(px: Tensor, pixel_px: float, valid: Tensor) -> Tensor:
