@@ -58,6 +58,8 @@ FLOORS = (
         "reward",
         "metrics",
         "calibration",
+        "fitting",
+        "shared_errors",
         "characterization",
         "propagation",
         "plane",

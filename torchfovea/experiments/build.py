@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Literal, TypeVar, cast
+from typing import Literal, cast
 
 import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
+from torchfovea.experiments.budgets import build_budget
+from torchfovea.experiments.settings import choice, construct, number, typed, whole
 from torchfovea.memory import sphere
 from torchfovea.memory.egosphere import Fusion, Prior
 from torchfovea.perception import Eligibility, Observer
 from torchfovea.sensing.camera import Camera, Fisheye, Pinhole
-from torchfovea.sensing.correspondence import Budget
 from torchfovea.sensing.head import Head, fixate
 from torchfovea.sensing.layout import LogPolar, Retina, Uniform
 from torchfovea.sensing.unscented import SigmaPoints
@@ -38,81 +39,15 @@ __all__ = [
     "whole",
 ]
 
-T = TypeVar("T")
-
 # A direction counts as reachable if its point at this range is: the neck turns about E, the eyes sit beside it.
 REACH_RANGE_M = 1.0
-
-
-def construct(kind: type[T], node: DictConfig | dict[str, Any], where: str) -> T:
-    """Build a dataclass from the settings of the same names; others are ignored.
-
-    Args:
-        kind: a frozen dataclass whose fields are floats, ints, bools and strings.
-        node: the settings.
-        where: their group's name, for errors.
-
-    Raises:
-        SettingError: for a value of another type, and whatever the dataclass itself refuses.
-    """
-    values = {}
-    for field in dataclasses.fields(kind):  # type: ignore[arg-type]
-        if field.name in node:
-            values[field.name] = _typed(node[field.name], str(field.type), f"{where}.{field.name}")
-    return kind(**values)
-
-
-def _typed(value: Any, kind: str, setting: str) -> Any:
-    """A value of a dataclass field's type, told by its name; `Range` is a pair of numbers."""
-    if kind.endswith("| None"):
-        return None if value is None else _typed(value, kind.removesuffix("| None").strip(), setting)
-    if kind == "Range":
-        pair = not isinstance(value, str) and hasattr(value, "__len__") and len(value) == 2
-        require(pair, setting, value, "two numbers, [least, most]")
-        return tuple(_typed(v, "float", setting) for v in value)
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    if kind == "float":
-        require(number, setting, value, "a number")
-        return float(value)
-    if kind == "int":
-        require(number and float(value).is_integer(), setting, value, "a whole number")
-        return int(value)
-    require(
-        kind not in ("bool", "str") or type(value).__name__ == kind,
-        setting,
-        value,
-        {"bool": "true or false"}.get(kind, "a word"),
-    )
-    return value
-
-
-def choice(cfg: DictConfig, setting: str, options: tuple[str, ...]) -> str:
-    """One of several words, read at a dotted name."""
-    value = OmegaConf.select(cfg, setting)
-    require(value in options, setting, value, "one of " + ", ".join(options))
-    return str(value)
-
-
-def whole(cfg: DictConfig, setting: str, least: int = 1) -> int:
-    """A whole number no smaller than `least`, read at a dotted name."""
-    value = _typed(OmegaConf.select(cfg, setting), "int", setting)
-    require(value >= least, setting, value, f"at least {least}")
-    return int(value)
-
-
-def number(cfg: DictConfig, setting: str) -> float:
-    """A positive number, read at a dotted name."""
-    given = OmegaConf.select(cfg, setting)
-    value = float(_typed(given, "float", setting))
-    require(value > 0, setting, given, "a positive number")
-    return value
 
 
 def build_sensor(cfg: DictConfig) -> tuple[Camera, Retina]:
     """The eyes' camera, in retinal pixels, and their retina."""
     layout = choice(cfg, "sensor.layout", ("log_polar", "uniform"))
     kind = choice(cfg, "sensor.camera", ("pinhole", "fisheye"))
-    fov_deg = _typed(cfg.sensor.fov_deg, "float", "sensor.fov_deg")
+    fov_deg = typed(cfg.sensor.fov_deg, "float", "sensor.fov_deg")
     widest = 180 if kind == "pinhole" else 360
     require(0 < fov_deg < widest, "sensor.fov_deg", fov_deg, f"more than 0 and less than {widest} for a {kind} camera")
     retina: Retina = (
@@ -129,11 +64,7 @@ def build_observer(cfg: DictConfig) -> Observer:
         head=construct(Head, cfg.head, "head"),
         camera=camera,
         retina=retina,
-        budget=construct(
-            Budget,
-            {**cfg.budget, "source_px": whole(cfg, "sensor.source_px", 16) if cfg.budget.source else None},
-            "budget",
-        ),
+        budget=build_budget(cfg),
         points=SigmaPoints.paper() if printed else None,
         rotated=not printed,
         fusion=construct(Fusion, cfg.fusion, "fusion"),

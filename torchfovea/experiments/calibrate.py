@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import shlex
+import sys
 from dataclasses import asdict, replace
 from itertools import pairwise
 from pathlib import Path
@@ -11,90 +13,113 @@ from typing import Any, Literal, NamedTuple, cast
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
-from rich.table import Table
-from torch import Tensor
 
 from torchfovea.config import run_folder
+from torchfovea.experiments.budgets import build_budget, made_for, write_budget
 from torchfovea.experiments.build import build_matcher, build_scene_of, build_sensor, choice, construct, whole
+from torchfovea.experiments.calibration_report import bins, print_figures, regions_of, table
+from torchfovea.experiments.pairs import gaze_of, load_pair, named_pair
 from torchfovea.experiments.progress import progress_bar
 from torchfovea.experiments.truths import Truths, look_at_pair, look_at_world
-from torchfovea.files import replacing, write_csv, write_result
+from torchfovea.files import write_csv, write_result
 from torchfovea.sensing.correspondence import Budget
 from torchfovea.sensing.head import Gaze, Head, fixate
 from torchfovea.setting import SettingError, require
 from torchfovea.sim.scene import Scene
 from torchfovea.sim.world import World
 from torchfovea.stereo.matchers import Matcher
-from torchfovea.studies.calibration import Judged, Likelihood, concatenate, fit_budget, judge, select, sigma_of
+from torchfovea.studies.calibration import Judged, concatenate, inlier_of, judge, select, sigma_of
+from torchfovea.studies.fitting import BudgetFit, Likelihood, fit_budget, least_match_px
+from torchfovea.studies.shared_errors import Sight, lasting_share, shared_share
 
-__all__ = ["BIN_COLUMNS", "random_gazes", "run"]
+__all__ = ["random_gazes", "run"]
 
-FIGURES = (
-    "nees_mean", "coverage_50", "coverage_90", "coverage_95", "coverage_99", "nll", "outlier_share", "ause",
-    "interval_over_error",
-)  # fmt: skip
-BIN_COLUMNS = (
-    "data", "model", "range_from_m", "range_to_m", "eccentricity_from_deg", "eccentricity_to_deg", "observations",
-    *FIGURES,
-)  # fmt: skip
 QUICK = {"scenes": 2, "judged_scenes": 2, "looks": 2}
 FULL = {"scenes": 16, "judged_scenes": 16, "looks": 2}
 JUDGED_SEEDS = 1000  # scenes to judge on have seeds from here, so that none is fitted on
-LEAST_IN_BIN = 50
+SHARPEST_PX = 0.01  # a fitted σ below this in a field of one source pixel has collapsed
 
 
 class Split(NamedTuple):
-    """Observations of one kind: to fit on, to judge on, and the share of receptive fields that were matched."""
+    """Observations of one kind.
+
+    Attributes:
+        fitted: to fit on.
+        judged: to judge on; the same where every other scene judges it (`Split.left_out`).
+        looks: all of them.
+        scenes: the looks of each scene that was fitted on.
+        left_out: whether a budget fitted without it is judged too.
+    """
 
     fitted: Judged
     judged: Judged
-    valid_fraction: float
+    looks: list[Truths]
+    scenes: list[list[Truths]]
+    left_out: bool = False
 
 
 def run(cfg: DictConfig) -> float:
-    """Calibrate; the negative log-likelihood of what was judged on is what a sweeper sees."""
+    """Calibrate; the mixture's negative log-likelihood of what was judged on is what a sweeper sees."""
     cfg = _sized(cfg)
     scenes, judged_scenes = whole(cfg, "scenes", 0), whole(cfg, "judged_scenes")
     looks, seed = whole(cfg, "looks"), whole(cfg, "seed", 0)
     require(isinstance(cfg.real, bool), "real", cfg.real, "true or false")
-    require(scenes > 0 or cfg.real, "scenes", scenes, "at least 1, or real=true")
-    budget = construct(
-        Budget, {**cfg.budget, "source_px": whole(cfg, "sensor.source_px", 16) if cfg.budget.source else None}, "budget"
-    )
+    require(OmegaConf.is_list(cfg.pairs), "pairs", cfg.pairs, "a list of motorcycle and folders")
+    require(scenes > 0 or cfg.real or len(cfg.pairs) > 0, "scenes", scenes, "at least 1, real=true or pairs")
+    budget = build_budget(cfg)
     start = replace(budget, source_px=whole(cfg, "sensor.source_px", 16))
-    likelihood = construct(Likelihood, cfg.fit, "fit")
-    edges = _edges(cfg, "range_edges_m"), _edges(cfg, "eccentricity_edges_deg")
     matcher, folder = build_matcher(cfg), run_folder()
+    likelihood = construct(Likelihood, {**cfg.fit, "nearest_m": matcher.nearest_m}, "fit")
+    edges = _edges(cfg, "range_edges_m"), _edges(cfg, "eccentricity_edges_deg")
+    angles = _edges(cfg, "fovs_deg", least=1) if len(cfg.fovs_deg) else [float(cfg.sensor.fov_deg)]
     data: dict[str, Split] = {}
     if scenes:
-        data["simulated"] = _simulate(cfg, start, matcher, scenes, judged_scenes, looks, seed)
-    if cfg.real:
-        data["real"] = _split(look_at_pair(cfg, start, matcher))
-    fit = fit_budget([split.fitted for split in data.values()], start, likelihood)
-    models = {"before": budget, "after": fit.budget}
+        data["simulated"] = _simulate(cfg, start, matcher, scenes, judged_scenes, looks, seed, angles)
+    data |= _pairs(cfg, start, matcher)
+
+    def fit(*without: str) -> BudgetFit:
+        chosen = {name: split for name, split in data.items() if name not in without}
+        step = max(look.step_px for split in chosen.values() for look in split.looks)
+        return fit_budget([split.fitted for split in chosen.values()], start, likelihood, least_match_px(step))
+
+    found = fit()
+    models = {name: {"before": budget, "after": found.budget} for name in data}
+    if len(data) > 1:
+        for name, split in data.items():
+            if split.left_out:
+                models[name]["left_out"] = fit(name).budget
+    after = _sharing(found.budget, data)
+    models = {name: laws | {"after": after} for name, laws in models.items()}
     figures: dict[str, Any] = {}
     for kind, split in data.items():
         prefix = "" if kind == next(iter(data)) else f"{kind}."
-        for model, law in models.items():
-            for name, value in judge(split.judged, sigma_of(split.judged, law)).items():
-                figures[f"{prefix}{model}.{name}"] = value
+        area = split.judged.area()
+        for model, law in models[kind].items():
+            claims = sigma_of(split.judged, law), inlier_of(split.judged, law), matcher.nearest_m
+            for suffix, weight in (("", None), ("_by_area", area)):
+                for name, value in judge(split.judged, *claims, weight).items():
+                    figures[f"{prefix}{model}.{name}{suffix}"] = value
+            figures |= {f"{prefix}{model}.{k}": v for k, v in regions_of(split.judged, *claims).items()}
         figures[f"{prefix}observations"] = split.judged.error.numel()
-        figures[f"{prefix}valid_fraction"] = split.valid_fraction
-    numbers = {name: value for name, value in asdict(fit.budget).items() if name != "source_px"}
+        for k, suffix in enumerate(("", "_by_area")):
+            figures[f"{prefix}valid_fraction{suffix}"] = _mean([look.valid_share[k] for look in split.looks])
+            figures[f"{prefix}hidden_valid{suffix}"] = _mean([look.hidden_valid_share[k] for look in split.looks])
+    numbers = {name: value for name, value in asdict(after).items() if name != "source_px"}
     figures |= {f"fit.{name}": value for name, value in numbers.items()}
-    figures |= {"fit.outlier_share": fit.outlier_share, "fit.loss": fit.loss, "fit.first_loss": fit.first_loss}
-    _write_budget(folder / "budget" / "fitted.yaml", numbers, cfg, fit.outlier_share)
-    write_csv(folder / "bins.csv", BIN_COLUMNS, _bins(data, models, *edges))
+    figures |= {"fit.loss": found.loss, "fit.first_loss": found.first_loss}
+    write_csv(folder / "bins.csv", *bins({k: s.judged for k, s in data.items()}, models, matcher.nearest_m, *edges))
+    write_csv(folder / "reliability.csv", *table({k: s.judged for k, s in data.items()}, models))
     from torchfovea.pictures.calibration import draw_calibration
 
     draw_calibration(
         folder / "calibration.png",
-        {kind: (s.judged, {m: sigma_of(s.judged, law) for m, law in models.items()}) for kind, s in data.items()},
+        {kind: (s.judged, {m: sigma_of(s.judged, law) for m, law in models[kind].items()}) for kind, s in data.items()},
     )
     write_result(folder, figures)
-    _print(figures, list(data))
-    return float(figures["after.nll"])
+    print_figures(figures, {kind: list(laws) for kind, laws in models.items()})
+    _refuse(figures, data, models, after)
+    _write(folder / "budget" / "fitted.yaml", after, cfg, data, angles)
+    return float(figures["after.mixture_nll"])
 
 
 def random_gazes(scene: Scene, world: World, count: int, generator: torch.Generator) -> list[Gaze]:
@@ -116,35 +141,97 @@ def random_gazes(scene: Scene, world: World, count: int, generator: torch.Genera
 
 
 def _simulate(
-    cfg: DictConfig, budget: Budget, matcher: Matcher, scenes: int, judged_scenes: int, looks: int, seed: int
+    cfg: DictConfig,
+    budget: Budget,
+    matcher: Matcher,
+    scenes: int,
+    judged_scenes: int,
+    looks: int,
+    seed: int,
+    angles: list[float],
 ) -> Split:
-    """Random looks at simulated scenes; those to judge on have seeds of their own."""
-    camera, retina = build_sensor(cfg)
+    """Random looks at simulated scenes, in turn at each field of view; those to judge on have seeds of their own."""
     head = construct(Head, cfg.head, "head")
     renderer = cast(Literal["rays", "gl"], choice(cfg, "renderer.name", ("rays", "gl")))
     seeds = [seed + k for k in range(scenes)], [seed + JUDGED_SEEDS + k for k in range(judged_scenes)]
-    parts: tuple[list[Truths], list[Truths]] = ([], [])
+    parts: tuple[list[list[Truths]], list[list[Truths]]] = ([], [])
     with progress_bar() as p:
         task = p.add_task("looks", total=(scenes + judged_scenes) * looks)
         for part, those in zip(parts, seeds, strict=True):
-            for k in those:
+            for i, k in enumerate(those):
+                sized = cfg.copy()
+                sized.sensor.fov_deg = angles[i % len(angles)]
+                camera, retina = build_sensor(sized)
                 scene = build_scene_of(cfg, head, k)
                 world = World(
                     scene, renderer=renderer, camera=camera, source_px=budget.source_px or 400,
                     radius_px=retina.radius_px,
                 )  # fmt: skip
+                part.append([])
                 for gaze in random_gazes(scene, world, looks, torch.Generator().manual_seed(k)):
-                    part.append(look_at_world(world, gaze, retina, budget, matcher))
+                    part[-1].append(look_at_world(world, gaze, retina, budget, matcher))
                     p.update(task, advance=1)
-    fitted, judged = (concatenate([look.data for look in part]) for part in parts)
-    shares = [look.valid_fraction for part in parts for look in part]
-    return Split(_known(fitted), _known(judged), sum(shares) / len(shares))
+    fitted, judged = (_known(concatenate([look.data for looks in part for look in looks])) for part in parts)
+    return Split(fitted, judged, [look for part in parts for looks in part for look in looks], parts[0])
 
 
-def _split(look: Truths) -> Split:
-    """The left half of a picture to fit on, the right half to judge on."""
-    left = look.right_of_middle_px < 0
-    return Split(_known(select(look.data, left)), _known(select(look.data, ~left)), look.valid_fraction)
+def _pairs(cfg: DictConfig, budget: Budget, matcher: Matcher) -> dict[str, Split]:
+    """Pairs with truth: a whole one is a scene; of the one that `real` names either half is."""
+    retina = build_sensor(cfg)[1]
+    found: dict[str, Split] = {}
+    for k, name in enumerate(cfg.pairs):
+        look = look_at_pair(named_pair(name, f"pairs[{k}]"), retina, None, budget, matcher)
+        data, title = _known(look.data), Path(str(name)).name
+        require(title not in (*found, "simulated", "real", "real_left"), f"pairs[{k}]", name, "a name of its own")
+        found[title] = Split(data, data, [look], [], left_out=True)
+    if cfg.real:
+        pair = load_pair(cfg)
+        look = look_at_pair(pair, retina, gaze_of(cfg, pair), budget, matcher)
+        column = look.data.place_px[:, 0]
+        # the retina looks at the picture's middle, or at the gaze
+        left, right = (_known(select(look.data, half)) for half in (column < 0, column >= 0))
+        found["real"] = Split(left, right, [look], [])
+        if cfg.pairs:
+            found["real"] = Split(right, right, [look], [], left_out=True)
+            found["real_left"] = Split(left, left, [look], [], left_out=True)
+    return found
+
+
+def _sharing(budget: Budget, data: dict[str, Split]) -> Budget:
+    """The budget with what errors have in common, where the looks tell."""
+    shared = shared_share([look.data for split in data.values() for look in split.looks], budget)
+    sights = [[Sight(t.data, t.point_m, t.axis) for t in looks] for split in data.values() for looks in split.scenes]
+    lasting = lasting_share(sights, budget)
+    shared = budget.shared if shared is None else shared
+    return replace(budget, shared=shared, lasting=min(budget.lasting if lasting is None else lasting, shared))
+
+
+def _refuse(figures: dict[str, Any], data: dict[str, Split], models: dict[str, dict[str, Budget]], law: Budget) -> None:
+    """Refuse a fit that is worse than before on what it did not see, or whose σ collapses."""
+    for kind in data:
+        prefix = "" if kind == next(iter(data)) else f"{kind}."
+        model = "left_out" if "left_out" in models[kind] else "after"
+        then, now = (figures[f"{prefix}{m}.mixture_nll_by_area"] for m in ("before", model))
+        good = now <= then
+        require(good, f"fit: {kind}, {model}, mixture_nll_by_area", f"{now:.3f}", f"at most {then:.3f}, as before")
+    sharpest = math.hypot(math.sqrt(2) * law.sigma_over_width, law.match_px)
+    require(sharpest > SHARPEST_PX, "fit: σ", f"{sharpest:.2g} px", f"more than {SHARPEST_PX} source pixels")
+
+
+def _write(path: Path, law: Budget, cfg: DictConfig, data: dict[str, Split], angles: list[float]) -> None:
+    """The fitted budget as a file of the group `budget`."""
+    simulated = [f"{cfg.scenes} scenes {cfg.scene.name}, {cfg.looks} looks each"] if cfg.scenes else []
+    pairs = [name.replace("real_left", "its other half").replace("real", "half a pair") for name in data]
+    command = " ".join(shlex.quote(Path(a).name if "=" not in a else a) for a in sys.argv[1:] if "run.dir" not in a)
+    comments = [
+        f"Fitted by: torchfovea {command} (torchfovea.sensing.correspondence.Budget says what the numbers are)",
+        f"Fitted on: {', '.join(simulated + [name for name in pairs if name != 'simulated'])}",
+    ]
+    sizes = [cfg.sensor.source_px] if cfg.scenes else []
+    sizes += [
+        round(2 * cfg.sensor.radius_px / float(s.judged.pixel_px[0])) for k, s in data.items() if k != "simulated"
+    ]
+    write_budget(path, law, comments, cfg.budget.sigma_points, made_for(cfg, angles if cfg.scenes else [], sizes))
 
 
 def _known(data: Judged) -> Judged:
@@ -153,37 +240,17 @@ def _known(data: Judged) -> Judged:
     return data
 
 
-def _bins(
-    data: dict[str, Split], models: dict[str, Budget], ranges: list[float], eccentricities: list[float]
-) -> list[tuple[Any, ...]]:
-    """Rows of bins.csv: everything, each range, each eccentricity, each of both; edges that do not bound are empty."""
-    rows: list[tuple[Any, ...]] = []
-    anywhere: list[tuple[float, float] | None] = [None]
-    for kind, split in data.items():
-        degrees = torch.rad2deg(split.judged.eccentricity_rad)
-        for low_high in anywhere + list(pairwise(ranges)):
-            for inner_outer in anywhere + list(pairwise(eccentricities)):
-                mask = _within(split.judged.range_m, low_high) & _within(degrees, inner_outer)
-                part, count = select(split.judged, mask), int(mask.sum())
-                for model, law in models.items():
-                    found = judge(part, sigma_of(part, law)) if count >= LEAST_IN_BIN else {}
-                    figures = (found.get(name) for name in FIGURES)
-                    bounds = *(low_high or (None, None)), *(inner_outer or (None, None))
-                    rows.append((kind, model, *bounds, count, *figures))
-    return rows
+def _mean(values: list[float]) -> float:
+    known = [v for v in values if math.isfinite(v)]
+    return sum(known) / len(known) if known else math.nan
 
 
-def _within(values: Tensor, edges: tuple[float, float] | None) -> Tensor:
-    if edges is None:
-        return torch.ones_like(values, dtype=torch.bool)
-    return (values >= edges[0]) & (values < edges[1])
-
-
-def _edges(cfg: DictConfig, setting: str) -> list[float]:
+def _edges(cfg: DictConfig, setting: str, least: int = 2) -> list[float]:
     values = OmegaConf.select(cfg, setting)
-    good = OmegaConf.is_list(values) and len(values) >= 2
+    good = OmegaConf.is_list(values) and len(values) >= least
     good = good and all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
-    require(good and all(a < b for a, b in pairwise(values)), setting, values, "two or more ascending numbers")
+    count = {1: "ascending numbers", 2: "two or more ascending numbers"}[least]
+    require(good and all(a < b for a, b in pairwise(values)), setting, values, count)
     return [float(v) for v in values]
 
 
@@ -195,30 +262,3 @@ def _sized(cfg: DictConfig) -> DictConfig:
         if OmegaConf.select(cfg, setting) is None:
             OmegaConf.update(cfg, setting, value)
     return cfg
-
-
-def _write_budget(path: Path, numbers: dict[str, float], cfg: DictConfig, outliers: float) -> None:
-    """The fitted budget as a file of the group `budget`."""
-    real = ", the left half of a real pair" if cfg.real else ""
-    simulated = f"{cfg.scenes} scenes {cfg.scene.name}, {cfg.looks} looks each" if cfg.scenes else "no simulation"
-    lines = [
-        "# Fitted by torchfovea calibrate; torchfovea.sensing.correspondence.Budget says what the numbers are.",
-        f"# Fitted on: {simulated}{real}; {cfg.sensor.layout}, {cfg.sensor.fov_deg:g} degrees, "
-        f"source {cfg.sensor.source_px} px, matcher {cfg.matcher.name}",
-        f"# Taken for outliers: {outliers:.2%}",
-        *(f"{name}: {value:.5g}" for name, value in numbers.items()),
-        "source: true",
-        f"sigma_points: {cfg.budget.sigma_points}",
-    ]
-    with replacing(path) as temporary:
-        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def _print(figures: dict[str, Any], kinds: list[str]) -> None:
-    table = Table("", *(f"{kind}, {model}" for kind in kinds for model in ("before", "after")), box=None)
-    for name in FIGURES:
-        prefixes = ["" if kind == kinds[0] else f"{kind}." for kind in kinds]
-        table.add_row(name, *(f"{figures[f'{p}{m}.{name}']:.4g}" for p in prefixes for m in ("before", "after")))
-    console = Console()
-    console.print(table)
-    console.print("  ".join(f"{k.removeprefix('fit.')} {v:.4g}" for k, v in figures.items() if k.startswith("fit.")))

@@ -54,19 +54,20 @@ def _array(path: Path, setting: str) -> np.ndarray:
         raise SettingError(f"{setting} = {path}: expected a NumPy file with an array of numbers") from error
 
 
-def write_ply(path: Path, mean: np.ndarray, cov: np.ndarray, colour: np.ndarray) -> None:
-    """Points as binary PLY, which every viewer opens; the covariance travels as extra properties.
+def write_ply(path: Path, mean: np.ndarray, cov: np.ndarray, colour: np.ndarray, inlier: np.ndarray) -> None:
+    """Points as binary PLY, which every viewer opens; covariance and inlier probability travel as extra properties.
 
     Args:
         path: the file.
         mean: (N, 3) [m].
         cov: (N, 6), xx xy xz yy yz zz [m²].
         colour: (N, 3) in [0, 1].
+        inlier: (N,) in [0, 1].
     """
-    names = [*"xyz", *(f"cov_{c}" for c in ("xx", "xy", "xz", "yy", "yz", "zz"))]
+    names = [*"xyz", *(f"cov_{c}" for c in ("xx", "xy", "xz", "yy", "yz", "zz")), "inlier"]
     record = np.dtype([(name, "<f4") for name in names] + [(name, "u1") for name in ("red", "green", "blue")])
     vertices = np.empty(len(mean), record)
-    for name, column in zip(names, np.concatenate([mean, cov], -1).T, strict=True):
+    for name, column in zip(names, np.concatenate([mean, cov, inlier[:, None]], -1).T, strict=True):
         vertices[name] = column
     for name, column in zip(("red", "green", "blue"), colour.T, strict=True):
         vertices[name] = (column.clip(0, 1) * 255).round()

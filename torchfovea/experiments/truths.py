@@ -6,23 +6,20 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import torch
-from omegaconf import DictConfig
 from torch import Tensor
 
-from torchfovea.experiments.build import build_sensor
-from torchfovea.experiments.sense import load_pair
+from torchfovea.experiments.pairs import Pair
+from torchfovea.experiments.regions import REGIONS, regions, truth_step_px
 from torchfovea.sensing.camera import Camera
-from torchfovea.sensing.correspondence import Budget, Clues, Correspondences, Disparity
+from torchfovea.sensing.correspondence import Budget, Correspondences, once_a_pixel
 from torchfovea.sensing.head import Eyes, Gaze, eyes
 from torchfovea.sensing.layout import Retina
-from torchfovea.setting import SettingError, require
+from torchfovea.setting import SettingError
 from torchfovea.sim.world import World
-from torchfovea.stereo.confidence import read_clues
 from torchfovea.stereo.matchers import Matcher, match_eyes, match_pair
 from torchfovea.stereo.rectified import match_disparity
 from torchfovea.stereo.rig import verged
-from torchfovea.stereo.sweep import Sweep
-from torchfovea.studies.calibration import Judged, judged
+from torchfovea.studies.calibration import Judged, judged, select
 
 __all__ = ["Truths", "look_at_pair", "look_at_world"]
 
@@ -31,73 +28,109 @@ class Truths(NamedTuple):
     """What one look tells.
 
     Attributes:
-        data: the observations, M of them.
-        right_of_middle_px: (M,), where the left image shows them, from its middle column [px].
-        valid_fraction: share of the receptive fields that the matcher calls valid.
+        data: the observations, M of them: one a source pixel.
+        point_m: (M, 3), the true points, in a frame that all looks at one scene share.
+        valid_share: share of the receptive fields that the matcher calls valid, by field and by area.
+        hidden_valid_share: likewise, of those that the right eye cannot see; NaN where there are none.
+        step_px: the step in which the truth comes [source px].
+        axis: (3,), where the left eye looks, in the frame of `point_m`.
     """
 
     data: Judged
-    right_of_middle_px: Tensor
-    valid_fraction: float
+    point_m: Tensor
+    valid_share: tuple[float, float]
+    hidden_valid_share: tuple[float, float]
+    step_px: float
+    axis: Tensor
 
 
 def look_at_world(world: World, gaze: Gaze, retina: Retina, budget: Budget, matcher: Matcher) -> Truths:
     """Match both eyes' pictures; the truth is cast along the left receptive fields' rays."""
-    left, right = (frame.image for frame in world.images(gaze))
+    left, right = world.images(gaze)
     rig, pose = verged(gaze.vergence, world.head.baseline_m), eyes(world.head, gaze)
-    matches, found = match_eyes(matcher, left, right, rig, world.camera, retina, budget)
-    clues = None
-    if isinstance(found, Disparity):
-        place = found.camera.project(world.camera.rays(matches.left_px) @ rig.R_left.to(matches.left_px).mT)
-        other = found.camera.project(world.camera.rays(matches.right_px) @ rig.R_right.to(matches.left_px).mT)
-        clues = _clues(found, place, (place - other)[:, 0], retina, world.source_px)
+    matches, found = match_eyes(matcher, left.image, right.image, rig, world.camera, retina, budget)
     seen = world.correspond(gaze, world.camera.rays(matches.left_px))
     away = torch.linalg.vector_norm(seen.points_e.double() - pose.t_left, dim=-1)
     truth = torch.where(seen.hit, 1 / away, torch.zeros_like(away))
-    data, which = judged(matches, pose, world.camera, retina, budget, truth, clues)
-    return Truths(data, matches.left_px[which, 0], float(matches.valid.double().mean()))
+    # pixels of disparity, but for the rays' slant
+    shift = world.image_camera.focal_px * world.head.baseline_m / left.range_m
+    around = regions(shift, left.image, torch.zeros_like(left.geom, dtype=torch.bool))
+    scale = world.source_px / (2 * retina.radius_px)
+    region = _at(around, matches.left_px * scale + (world.source_px - 1) / 2)
+    region = torch.where(seen.hit & ~seen.visible_right, REGIONS.index("hidden"), region)
+    data, which = judged(matches, pose, world.camera, retina, budget, truth, found.clues, region=region)
+    return _told(
+        data, which, seen.points_e.double(), matches, region, seen.hit, retina, 1 / scale, 0.0, pose.R_left[:, 2]
+    )
 
 
-def look_at_pair(cfg: DictConfig, budget: Budget, matcher: Matcher) -> Truths:
+def look_at_pair(
+    pair: Pair, retina: Retina, gaze_px: tuple[float, float] | None, budget: Budget, matcher: Matcher
+) -> Truths:
     """Match a rectified pair; the truth is its disparity.
 
     Raises:
         SettingError: for a pair without true disparity.
     """
-    pair = load_pair(cfg)
     if pair.disparity is None:
         raise SettingError("disparity = null: expected the true disparity of the pair, to judge by")
-    retina = build_sensor(cfg)[1]
-    if cfg.gaze_px is not None:
-        require(len(cfg.gaze_px) == 2, "gaze_px", cfg.gaze_px, "[column, row]")
-    gaze = None if cfg.gaze_px is None else (float(cfg.gaze_px[0]), float(cfg.gaze_px[1]))
     height, width = pair.left.shape[-2:]
     cameras = pair.camera_left, pair.camera_right, pair.baseline_m
-    true = match_disparity(pair.disparity, *cameras, retina, gaze, nearest_range_m=1e-3)
+    true = match_disparity(pair.disparity, *cameras, retina, gaze_px, nearest_range_m=1e-3)
     scale = pair.camera_left.focal_px / true.camera_left.focal_px
-    middle = true.correspondences.left_px.new_tensor(gaze or ((width - 1) / 2, (height - 1) / 2))
-    place = true.correspondences.left_px * scale + middle
+    middle = true.correspondences.left_px.new_tensor(gaze_px or ((width - 1) / 2, (height - 1) / 2))
     same = torch.eye(3)
     pose = Eyes(same, torch.zeros(3), same, torch.tensor([pair.baseline_m, 0.0, 0.0]))
-    source = min(height, width)
-    budget = replace(budget, source_px=source)
-    found = match_pair(matcher, pair.left, pair.right, *cameras, retina, gaze, budget)
-    matches, clues = found.correspondences, None
-    if not isinstance(matcher.params, Sweep):  # whose map is its receptive fields'
-        shift = (matches.left_px - matches.right_px)[:, 0] * scale
-        clues = _clues(found.disparity, place, shift, retina, source)
+    budget = replace(budget, source_px=min(height, width))
+    found = match_pair(matcher, pair.left, pair.right, *cameras, retina, gaze_px, budget)
+    matches = found.correspondences
     truth = _inverse_range(true.correspondences, true.camera_left, true.camera_right, pair.baseline_m)
-    truth = torch.where(true.correspondences.valid, truth, torch.zeros_like(truth))
-    data, which = judged(matches, pose, true.camera_left, retina, budget, truth, clues, true.camera_right)
-    return Truths(data, (place[:, 0] - (width - 1) / 2)[which], float(matches.valid.double().mean()))
+    known = true.correspondences.valid
+    truth = torch.where(known, truth, torch.zeros_like(truth))
+    region = _at(regions(pair.disparity, pair.left), matches.left_px * scale + middle)
+    data, which = judged(
+        matches, pose, true.camera_left, retina, budget, truth, found.disparity.clues, true.camera_right, region=region
+    )
+    ray = torch.nn.functional.normalize(true.camera_left.rays(matches.left_px), dim=-1)
+    points = ray / torch.where(known, truth, torch.ones_like(truth))[:, None]
+    step = truth_step_px(pair.disparity)
+    return _told(data, which, points.double(), matches, region, known, retina, 1 / scale, step, same[2])
+
+
+def _told(
+    data: Judged,
+    which: Tensor,
+    points: Tensor,
+    matches: Correspondences,
+    region: Tensor,
+    known: Tensor,
+    retina: Retina,
+    pixel_px: float,
+    step_px: float,
+    axis: Tensor,
+) -> Truths:
+    area = retina.width_px(matches.left_px).square()
+    hidden = known & (region == REGIONS.index("hidden"))
+    once = once_a_pixel(matches.left_px, pixel_px, which)[which]
+    return Truths(
+        select(data, once), points[which][once], _shares(matches.valid, torch.ones_like(hidden), area),
+        _shares(matches.valid, hidden, area), step_px, axis.double(),
+    )  # fmt: skip
+
+
+def _shares(valid: Tensor, among: Tensor, area: Tensor) -> tuple[float, float]:
+    by_field, by_area = (float((w * (valid & among)).sum() / (w * among).sum()) for w in (torch.ones_like(area), area))
+    return by_field, by_area
+
+
+def _at(values: Tensor, place: Tensor) -> Tensor:
+    """A map (H, W) at the pixels nearest to places (N, 2)."""
+    height, width = values.shape
+    column, row = place.round().long().unbind(-1)
+    return values[row.clamp(0, height - 1), column.clamp(0, width - 1)]
 
 
 def _inverse_range(matches: Correspondences, left: Camera, right: Camera, baseline_m: float) -> Tensor:
     """Of places (N, 2) in both rectified cameras, along the left ray."""
     one, other = left.rays(matches.left_px), right.rays(matches.right_px)
     return (one - other)[:, 0] / baseline_m / torch.linalg.vector_norm(one, dim=-1)
-
-
-def _clues(disparity: Disparity, place: Tensor, shift: Tensor, retina: Retina, source_px: int) -> Clues:
-    width_px = retina.width_px(retina.centers_px(place.device, place.dtype)) * (source_px / (2 * retina.radius_px))
-    return read_clues(disparity, place, shift, width_px)

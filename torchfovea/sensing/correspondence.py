@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -13,7 +13,18 @@ from torchfovea.sensing.camera import Pinhole
 from torchfovea.sensing.retina import Retina
 from torchfovea.setting import require
 
-__all__ = ["Budget", "Clues", "Correspondences", "Disparity", "Kinship", "doubt", "eye_sigma_px", "kinship"]
+__all__ = [
+    "Budget",
+    "Clues",
+    "Correspondences",
+    "Disparity",
+    "Kinship",
+    "doubt",
+    "eye_sigma_px",
+    "inlier_share",
+    "kinship",
+    "once_a_pixel",
+]
 
 
 class Correspondences(NamedTuple):
@@ -122,12 +133,20 @@ class Kinship(NamedTuple):
 
 @dataclass(frozen=True)
 class Budget:
-    """What limits a correspondence, as variances that add up: an RF cannot be sharper than its source.
+    """What limits a correspondence, as variances that add up, and how probably it is one at all.
 
-    σ² = (s W)² + (s p)² + (m p)² per eye and axis, with s = `sigma_over_width`, W the RF's width, p the size of a
-    source pixel on the retina and m the matcher's own error: m² = `match_px`² + (`bend`·bend)² + (`gap`·gap)² with the
-    clues of each correspondence, where the matcher gives any. The paper has the first term only: `Budget.printed`.
-    `torchfovea calibrate` fits the numbers (`torchfovea.studies.calibration`).
+    An error is N(0, σ²) with probability p and anything that was searched with 1 − p. Per eye and axis
+
+        σ² = (s W)² + (s p)² + (m p)²,   m² = match_px² + (bend b)² + (gap g)² + (fringe f)² + (noise n)²,
+
+    with s = `sigma_over_width`, W the RF's width, p the size of a source pixel on the retina (an RF cannot be sharper
+    than its source), m the matcher's own error and b, g, f, n its `Clues` where it gives any. The odds of an outlier:
+
+        (1 − p)/p = outliers/(1 − outliers) · (1 + b)^outliers_bend · (1 + g)^outliers_gap · (1 + f)^outliers_fringe ·
+        (1 + h)^outliers_hidden · e^(outliers_mismatch c),
+
+    with the clues h = hidden_px and c = mismatch. The paper has the first term only: `Budget.printed`. `torchfovea
+    calibrate` fits the numbers (`torchfovea.studies.fitting`).
 
     Attributes:
         sigma_over_width: s; 1/6 lets three standard deviations span half a width.
@@ -135,11 +154,19 @@ class Budget:
         match_px: the matcher's error in each eye on a smooth surface [source px].
         bend: share of a reading's `Clues.bend_px` that is error; 0: not asked.
         gap: share of `Clues.gap_px`; 0: not asked.
+        fringe: share of `Clues.fringe_px`; 0: not asked.
+        noise: factor on `Clues.noise_px`, which the pair's own noise and texture bound; 0: not asked.
         claim: factor on the standard deviation that a matcher itself claims (the sweep's curve of costs, a foreign
             matcher's confidence).
+        outliers: share of outliers where no clue speaks; 0: every correspondence is certain.
+        outliers_bend: exponent of the odds.
+        outliers_gap: likewise.
+        outliers_fringe: likewise.
+        outliers_hidden: likewise.
+        outliers_mismatch: rate of the odds' growth.
         shared: share of a match's variance that neighbouring fields of one look have in common, because they see the
-            same pixels of the same surface; 0: independent, as in the paper. It fades with the distance of the fields,
-            with a length of `max(shared_px source pixels, shared_widths widths)`.
+            same pixels of the same surface; 0: independent, as in the paper. It fades with the fields' distance d as
+            e^(−d/L), L = max(shared_px source pixels, shared_widths widths).
         shared_px: see `shared` [source px].
         shared_widths: see `shared` [widths of the receptive field].
         lasting: share of the variance that another look at the same patch of surface has in common with this one; 0:
@@ -151,7 +178,15 @@ class Budget:
     match_px: float = 0.15
     bend: float = 0.0
     gap: float = 0.0
+    fringe: float = 0.0
+    noise: float = 0.0
     claim: float = 1.0
+    outliers: float = 0.0
+    outliers_bend: float = 0.0
+    outliers_gap: float = 0.0
+    outliers_fringe: float = 0.0
+    outliers_hidden: float = 0.0
+    outliers_mismatch: float = 0.0
     shared: float = 0.0
     shared_px: float = 4.0
     shared_widths: float = 2.0
@@ -168,15 +203,14 @@ class Budget:
             self.source_px is None or self.source_px > 0, "sensor.source_px", self.source_px, "a positive number of px"
         )
         require(0 <= self.match_px < math.inf, "sensor.match_px", self.match_px, "0 or more source pixels")
-        for name in ("bend", "gap", "claim", "shared_px", "shared_widths"):
-            require(0 <= getattr(self, name) < math.inf, f"budget.{name}", getattr(self, name), "0 or more")
-        require(0 <= self.shared < 1, "budget.shared", self.shared, "a share, 0 or more and less than 1")
-        require(
-            0 <= self.lasting <= self.shared,
-            "budget.lasting",
-            self.lasting,
-            f"0 or more and not above budget.shared = {self.shared:g}",
-        )
+        for field in fields(self):
+            if field.name not in ("sigma_over_width", "source_px", "match_px"):
+                value = getattr(self, field.name)
+                require(0 <= value < math.inf, f"budget.{field.name}", value, "0 or more")
+        for name in ("outliers", "shared"):
+            require(getattr(self, name) < 1, f"budget.{name}", getattr(self, name), "a share, less than 1")
+        least = f"0 or more and not above budget.shared = {self.shared:g}"
+        require(self.lasting <= self.shared, "budget.lasting", self.lasting, least)
 
 
 Budget.printed = Budget(source_px=None, match_px=0.0)
@@ -224,5 +258,55 @@ def kinship(budget: Budget, retina: Retina, px: Tensor, looked_through: float = 
 
 
 def doubt(budget: Budget, clues: Clues) -> Tensor:
-    """The variance that the clues (...) add in each eye [source px²]."""
-    return (budget.bend * clues.bend_px).square() + (budget.gap * clues.gap_px).square()
+    """The variance that the clues (...) add in each eye [source px²]. Differentiable."""
+    parts = (
+        (budget.bend, clues.bend_px), (budget.gap, clues.gap_px), (budget.fringe, clues.fringe_px),
+        (budget.noise, clues.noise_px),
+    )  # fmt: skip
+    square = torch.zeros_like(clues.bend_px)
+    for factor, clue in parts:
+        square = square if clue is None else square + (factor * clue).square()
+    return square
+
+
+def inlier_share(budget: Budget, clues: Clues) -> Tensor:
+    """Probability that a correspondence shows one point at all, by its clues (...); 1 where `outliers` is 0.
+
+    Differentiable.
+    """
+    parts = (
+        (budget.outliers_bend, clues.bend_px), (budget.outliers_gap, clues.gap_px),
+        (budget.outliers_fringe, clues.fringe_px), (budget.outliers_hidden, clues.hidden_px),
+    )  # fmt: skip
+    odds = torch.full_like(clues.bend_px, budget.outliers / (1 - budget.outliers))
+    for power, clue in parts:
+        odds = odds if clue is None else odds * (1 + clue) ** power
+    if clues.mismatch is not None:
+        odds = odds * (budget.outliers_mismatch * clues.mismatch).exp()
+    return 1 / (1 + odds)
+
+
+def once_a_pixel(px: Tensor, pixel_px: float, valid: Tensor) -> Tensor:
+    """Receptive fields that do not copy another's pixel: of those on one source pixel, the one nearest to its middle.
+
+    Fields narrower than a source pixel read the same few pixels; taken for as many observations, they would count one
+    error dozens of times.
+
+    Args:
+        px: (N, 2), the fields' centres [retinal px].
+        pixel_px: side of a source pixel [retinal px].
+        valid: bool (N,), which fields to choose from.
+
+    Returns:
+        bool (N,), those chosen.
+    """
+    at = px.detach().double() / pixel_px
+    cell = at.round()
+    _, group = torch.unique(cell, dim=0, return_inverse=True)
+    away = torch.where(valid, (at - cell).square().sum(-1), math.inf)
+    count = int(group.max()) + 1 if len(group) else 0
+    nearest = away.new_full((count,), math.inf).scatter_reduce(0, group, away, "amin")
+    order = torch.arange(len(px), device=px.device)
+    best = torch.where(valid & (away == nearest[group]), order, len(px))
+    first = order.new_full((count,), len(px)).scatter_reduce(0, group, best, "amin")
+    return valid & (order == first[group])

@@ -16,7 +16,15 @@ from torch import Tensor
 
 from torchfovea.gaussian import columns
 from torchfovea.sensing.camera import Camera, Pinhole
-from torchfovea.sensing.correspondence import Budget, Clues, Correspondences, Disparity, doubt, eye_sigma_px
+from torchfovea.sensing.correspondence import (
+    Budget,
+    Clues,
+    Correspondences,
+    Disparity,
+    doubt,
+    eye_sigma_px,
+    inlier_share,
+)
 from torchfovea.sensing.retina import Retina, fovea, interpolate
 from torchfovea.setting import require
 from torchfovea.stereo.confidence import read_clues
@@ -227,9 +235,10 @@ def correspondences(
 ) -> Correspondences:
     """Places (N, 2) in both eyes with their σ from the budget; without a retina in image pixels."""
     right_px = torch.where(valid[:, None], right_px, left_px)
+    inlier = valid.to(left_px) if clues is None else valid * inlier_share(budget, clues)
     if retina is None:  # the RFs are the source's pixels
         square = torch.full_like(left_px[:, 0], budget.sigma_over_width**2 + budget.match_px**2)
         sigma = (square if clues is None else square + doubt(budget, clues)).sqrt()
-        return Correspondences(left_px, right_px, sigma, sigma, valid, valid.to(sigma))
+        return Correspondences(left_px, right_px, sigma, sigma, valid, inlier)
     left_sigma, right_sigma = (eye_sigma_px(budget, retina, px, clues) for px in (left_px, right_px))
-    return Correspondences(left_px, right_px, left_sigma, right_sigma, valid, valid.to(left_sigma))
+    return Correspondences(left_px, right_px, left_sigma, right_sigma, valid, inlier)

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from torchfovea.gaussian import columns
 from torchfovea.sensing.camera import Camera, Pinhole
-from torchfovea.sensing.correspondence import Budget, Clues, Correspondences, Disparity, eye_sigma_px
+from torchfovea.sensing.correspondence import Budget, Clues, Correspondences, Disparity, eye_sigma_px, inlier_share
 from torchfovea.sensing.layout import Retina
 from torchfovea.setting import require
 from torchfovea.stereo.confidence import field_clues
@@ -160,7 +160,7 @@ def match_sweep(
         eye_sigma_px(budget, retina, left_px, clues).expand(batch, -1),
         (eye_sigma_px(budget, retina, right_px, clues).square() + budget.claim**2 * match_px).sqrt(),
         valid,
-        valid.to(rho),
+        valid * inlier_share(budget, clues),
     )
     inverse_range, sigma, correlation = (
         torch.where(valid, x, zero) for x in (rho / length, sigma / length, correlation)

@@ -1,0 +1,82 @@
+"""Single settings of a composed configuration, each checked under the name the user knows."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, TypeVar
+
+from omegaconf import DictConfig, OmegaConf
+
+from torchfovea.setting import require
+
+__all__ = ["choice", "construct", "number", "typed", "whole"]
+
+T = TypeVar("T")
+
+
+def construct(kind: type[T], node: DictConfig | dict[str, Any], where: str) -> T:
+    """Build a dataclass from the settings of the same names; others are ignored.
+
+    Args:
+        kind: a frozen dataclass whose fields are floats, ints, bools and strings.
+        node: the settings.
+        where: their group's name, for errors.
+
+    Raises:
+        SettingError: for a value of another type, and whatever the dataclass itself refuses.
+    """
+    values = {}
+    for field in dataclasses.fields(kind):  # type: ignore[arg-type]
+        if field.name in node:
+            values[field.name] = typed(node[field.name], str(field.type), f"{where}.{field.name}")
+    return kind(**values)
+
+
+def typed(value: Any, kind: str, setting: str) -> Any:
+    """A value of a dataclass field's type, told by its name; `Range` is a pair of numbers.
+
+    Raises:
+        SettingError: for a value of another type.
+    """
+    if kind.endswith("| None"):
+        return None if value is None else typed(value, kind.removesuffix("| None").strip(), setting)
+    if kind == "Range":
+        pair = not isinstance(value, str) and hasattr(value, "__len__") and len(value) == 2
+        require(pair, setting, value, "two numbers, [least, most]")
+        return tuple(typed(v, "float", setting) for v in value)
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if kind == "float":
+        require(number, setting, value, "a number")
+        return float(value)
+    if kind == "int":
+        require(number and float(value).is_integer(), setting, value, "a whole number")
+        return int(value)
+    require(
+        kind not in ("bool", "str") or type(value).__name__ == kind,
+        setting,
+        value,
+        {"bool": "true or false"}.get(kind, "a word"),
+    )
+    return value
+
+
+def choice(cfg: DictConfig, setting: str, options: tuple[str, ...]) -> str:
+    """One of several words, read at a dotted name."""
+    value = OmegaConf.select(cfg, setting)
+    require(value in options, setting, value, "one of " + ", ".join(options))
+    return str(value)
+
+
+def whole(cfg: DictConfig, setting: str, least: int = 1) -> int:
+    """A whole number no smaller than `least`, read at a dotted name."""
+    value = typed(OmegaConf.select(cfg, setting), "int", setting)
+    require(value >= least, setting, value, f"at least {least}")
+    return int(value)
+
+
+def number(cfg: DictConfig, setting: str) -> float:
+    """A positive number, read at a dotted name."""
+    given = OmegaConf.select(cfg, setting)
+    value = float(typed(given, "float", setting))
+    require(value > 0, setting, given, "a positive number")
+    return value
