@@ -45,6 +45,31 @@ def test_a_bias_toward_the_target_puts_cells_there(folder, capsys):
     assert near[0] > 3 * near[1]
 
 
+def test_honesty_is_judged_by_sensor_size_and_look(folder, capsys):
+    more = ["sensor.source_px=96", "sensor.fov_deg=90", "honesty.cells=[200,400]", "honesty.looks=[2,1]"]
+    run, result = memory(capsys, *SMALL, "study=honesty", "episodes=2", *more)
+    assert len((run / "honesty.csv").read_text().splitlines()) == 1 + 3 * 2 * 2
+    for sensor in ("sgbm", "sweep", "geometric"):
+        for looks in (1, 2):
+            figures = {k.split(".")[-1]: v for k, v in result.items() if k.startswith(f"{sensor}.400.{looks}.")}
+            assert figures["coverage_95_low"] <= figures["coverage_95"] <= figures["coverage_95_high"]
+            assert 0 <= figures["coverage_50"] <= figures["coverage_95"] <= 1
+            assert 0 < figures["median_error"] <= figures["mean_error"]
+            assert 0.5 < figures["believed"] <= 1 and 0 < figures["straddling"] < 1
+    # the geometric sensor draws its noise from its budget
+    assert 0.7 < result["geometric.400.1.nees_mean"] < 1.4 and result["geometric.400.1.outlier_share"] < 0.05
+
+
+@pytest.mark.parametrize(
+    ("setting", "named"),
+    [("honesty.sensors=[sgbm,eyes]", "honesty.sensors"), ("honesty.cells=[]", "honesty.cells"),
+     ("honesty.looks=[0]", "honesty.looks"), ("honesty.looks=5", "honesty.looks")],
+)  # fmt: skip
+def test_honesty_names_what_it_cannot_judge(folder, capsys, setting, named):
+    assert main(["memory", "study=honesty", setting]) != 0
+    assert named in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("study", "more", "rows"),
     [

@@ -23,7 +23,8 @@ RESULT = {
     "episodes",
 }
 SACCADES = (
-    "episode,saccade,pan_rad,tilt_rad,vergence_rad,range_m,reward,gap,regret,global_information,local_information"
+    "episode,saccade,pan_rad,tilt_rad,vergence_rad,range_m,reward,gap,regret,global_information,local_information,"
+    "aimed_m,phantom"
 )
 
 

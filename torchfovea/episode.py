@@ -17,7 +17,7 @@ from torchfovea.deciding.acquisition import known_well_enough
 from torchfovea.memory.nearest import join_indices
 from torchfovea.metrics import gap, global_information, local_information, near_target, regret, saccades_to_target
 from torchfovea.perception import Mind, Observer, Step, decide, gaze_at, perceive
-from torchfovea.sensing.head import Gaze, eyes, fixate
+from torchfovea.sensing.head import Gaze, eyes, fixate, gaze_point
 from torchfovea.setting import require
 
 __all__ = [
@@ -49,6 +49,7 @@ class Episode(NamedTuple):
         gaze: executed.
         direction: unit direction in E of the true point at the fixation, (T, 3).
         range_m: true range at the fixation.
+        aimed_m: range of the point that both eyes turned to.
         reward: −range, floor or a miss −far_m.
         gap: Eq. 46.
         regret: Eq. 50.
@@ -68,6 +69,7 @@ class Episode(NamedTuple):
     gaze: Gaze
     direction: Tensor
     range_m: Tensor
+    aimed_m: Tensor
     reward: Tensor
     gap: Tensor
     regret: Tensor
@@ -212,6 +214,7 @@ def run_episodes(
     hit = over_time([f.is_target for f in fixations])
     points = torch.stack([f.point.double().cpu() for f in fixations], 1)
     gazes = [over_time(angle).double() for angle in zip(*(move.gaze for move in moves), strict=True)]
+    aimed = gaze_point(observer.head, Gaze(*gazes)).norm(dim=-1)
     informed = over_time(gathered).double()
     locally = over_time(local).double()
     far_travelled, took = (over_time([m[k] for m in moves]).double().sum(-1) for k in (2, 1))
@@ -224,6 +227,7 @@ def run_episodes(
                 gaze=Gaze(*(angle[b] for angle in gazes)),
                 direction=torch.nn.functional.normalize(points[b], dim=-1),
                 range_m=ranges[b],
+                aimed_m=aimed[b],
                 reward=reward[b],
                 gap=gap(reward[b], best),
                 regret=regret(reward[b], best),

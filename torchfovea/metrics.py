@@ -31,6 +31,7 @@ __all__ = [
     "nees",
     "nees_mean",
     "outlier_share",
+    "phantom",
     "regret",
     "regret_per_saccade",
     "saccades_to_target",
@@ -96,6 +97,20 @@ def degrees_travelled(directions: Tensor) -> Tensor:
     now, then = directions[..., :-1, :], directions[..., 1:, :]
     sine = torch.linalg.vector_norm(torch.linalg.cross(now, then), dim=-1)
     return torch.rad2deg(torch.atan2(sine, (now * then).sum(-1))).sum(-1)
+
+
+def phantom(aimed_m: Tensor, range_m: Tensor, nearer: float = 0.4) -> Tensor:
+    """Whether a saccade aimed at nothing: at a point clearly nearer than the first surface on its line of sight.
+
+    Args:
+        aimed_m: range of the point that both eyes turned to (...); inf: none.
+        range_m: range of the surface (...); inf: none.
+        nearer: by how much in inverse range [1/m].
+
+    Returns:
+        bool (...).
+    """
+    return 1 / aimed_m - 1 / range_m > nearer
 
 
 # --- of the map ------------------------------------------------------------------------------------------------------

@@ -169,8 +169,10 @@ def perceive(
         kin = kin._replace(lasting=kin.lasting + (kin.shared - kin.lasting) * same)
     before = mind.memory
     after = remember(before, mind.lookup, mind.spacing_rad, observed, observer.fusion, observer.prior, common, kin)
-    missed = (before.looks > 0) & (after.looks == before.looks) & _in_view(observer, before, eyes)
-    return mind._replace(memory=after._replace(votes=against(after.votes, missed)), axis=axis)
+    if observer.fusion.chart == "inverse_range":
+        missed = (after.looks == before.looks) & _in_view(observer, before, eyes)
+        after = after._replace(votes=against(after.votes, missed))
+    return mind._replace(memory=after, axis=axis)
 
 
 def _in_view(observer: Observer, memory: EgoSphere, eyes: Eyes) -> Tensor:
@@ -189,7 +191,8 @@ def reward_of(observer: Observer, mind: Mind) -> tuple[Gaussian, RewardBelief]:
 
     A surface is worth its reward as far as it is believed, for the rest what an unseen cell is: mean and standard
     deviation are averaged with the prior's by `torchfovea.memory.egosphere.trust`, so that no doubtful surface wins a
-    comparison of thousands. Unseen cells share the prior's reward exactly: ties are ties.
+    comparison of thousands. Of the prior's standard deviation looks that should have shown something, and did not,
+    leave less and less. Unseen cells that no look has reached share the prior's reward exactly: ties are ties.
     """
     moments = belief(mind.memory)
     prior = observer.prior
@@ -205,12 +208,12 @@ def reward_of(observer: Observer, mind: Mind) -> tuple[Gaussian, RewardBelief]:
         unseen = RewardBelief(*(torch.tensor(v, dtype=points.mean.dtype) for v in (prior.mean, prior.std)))
         if observer.reward == "range":
             reward, unseen = range_from_inverse_range(reward), range_from_inverse_range(unseen)
-    sure = trust(mind.memory)
-    exact = (
-        torch.where(sure > 0, sure * now + (1 - sure) * then, then.to(now))
-        for now, then in zip(reward, unseen, strict=True)
-    )
-    return points, RewardBelief(*exact)
+    sure, fruitless = trust(mind.memory), mind.memory.votes[..., 1]
+    mean, std = (then.to(reward.mean) for then in unseen)
+    std = std * (1 + fruitless).rsqrt()
+    mean = torch.where(sure > 0, sure * reward.mean + (1 - sure) * mean, mean)
+    std = torch.where(sure > 0, sure * reward.std + (1 - sure) * std, std)
+    return points, RewardBelief(mean, std)
 
 
 def _unseen_points(observer: Observer, mind: Mind) -> Tensor:

@@ -84,7 +84,8 @@ def _checked(node: Any, where: str) -> dict[str, Any]:
 
 
 def _filled(cfg: DictConfig, node: dict[str, Any]) -> dict[str, Any]:
-    path = shipped(cfg)
+    geometric = OmegaConf.select(cfg, "fidelity") == "geometric"  # whose noise is what the budget says, and independent
+    path = Path(conf_dir()) / "budget" / "ours.yaml" if geometric else shipped(cfg)
     if path is None:
         _say(
             f"budget = auto: none comes along for {cfg.sensor.layout} and {cfg.matcher.name}, the uncalibrated one is "

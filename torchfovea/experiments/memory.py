@@ -9,6 +9,7 @@ from rich.table import Table
 
 from torchfovea.config import run_folder
 from torchfovea.experiments.build import build_arena, build_cells, build_observer, choice, number, whole
+from torchfovea.experiments.memory_honesty import study_honesty
 from torchfovea.experiments.memory_moving import study_moving, study_resampling
 from torchfovea.experiments.memory_study import Rows, study_encoders, study_fusion
 from torchfovea.files import write_csv, write_result
@@ -22,6 +23,7 @@ STUDIES = {
     "encoders": study_encoders,
     "moving": study_moving,
     "resampling": study_resampling,
+    "honesty": study_honesty,
 }
 
 
@@ -65,10 +67,11 @@ def _study(cfg: DictConfig, name: str) -> float:
     STUDIES[name](cfg, rows)
     write_csv(folder / f"{name}.csv", rows.columns, rows.rows)
     table = Table(box=None, padding=(0, 1, 0, 0))
-    for column in rows.columns:
+    shown = None if rows.shown is None else len(rows.labels) + rows.shown
+    for column in rows.columns[:shown]:
         table.add_column(column, justify="right")
     for row in rows.rows:
-        table.add_row(*("-" if v is None else f"{v:.4g}" if isinstance(v, float) else str(v) for v in row))
+        table.add_row(*("-" if v is None else f"{v:.4g}" if isinstance(v, float) else str(v) for v in row[:shown]))
     console = Console()
     if not console.is_terminal:
         console = Console(width=200)

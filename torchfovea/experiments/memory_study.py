@@ -42,10 +42,11 @@ COLUMNS = (
 
 @dataclass
 class Rows:
-    """A study's table: labels, then figures."""
+    """A study's table: labels, then figures, of which the screen shows the first `shown`."""
 
     labels: tuple[str, ...] = ()
     names: tuple[str, ...] = ()
+    shown: int | None = None
     rows: list[tuple[Any, ...]] = field(default_factory=list)
 
     @property

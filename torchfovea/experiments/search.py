@@ -21,6 +21,7 @@ from torchfovea.experiments.rollout import batched, device_of, one_episode, roll
 from torchfovea.experiments.strategy import build_stop, build_strategy
 from torchfovea.experiments.workers import worker_pool
 from torchfovea.files import write_csv
+from torchfovea.metrics import phantom
 from torchfovea.perception import Observer, Step
 from torchfovea.setting import require
 
@@ -29,11 +30,11 @@ __all__ = ["EPISODE_COLUMNS", "SACCADE_COLUMNS", "episode_row", "run", "saccade_
 EPISODE_COLUMNS = (
     "episode", "seed", "gap_final", "gap_per_saccade", "regret_per_saccade", "global_information_per_saccade",
     "local_information_per_saccade", "saccades_to_target", "found", "target_error_m", "degrees_travelled",
-    "motor_seconds", "seconds_per_saccade",
+    "motor_seconds", "seconds_per_saccade", "phantom_share",
 )  # fmt: skip
 SACCADE_COLUMNS = (
     "episode", "saccade", "pan_rad", "tilt_rad", "vergence_rad", "range_m", "reward", "gap", "regret",
-    "global_information", "local_information",
+    "global_information", "local_information", "aimed_m", "phantom",
 )  # fmt: skip
 
 
@@ -123,11 +124,12 @@ def _elsewhere(settings: str, seed: int) -> tuple[tuple[Any, ...], list[tuple[An
 def episode_row(episode: Episode) -> tuple[Any, ...]:
     """An episode's figures, in the order of EPISODE_COLUMNS from gap_final on."""
     local = episode.local_information
+    chosen = phantom(episode.aimed_m, episode.range_m)[1 : episode.looks]  # the first gaze is nobody's choice
     return (
         float(episode.gap[-1]), float(episode.gap.mean()), float(episode.regret.mean()),
         float(episode.global_information.mean()), None if local is None else float(local.mean()),
         episode.moves, int(episode.hit.any()), episode.target_error_m, episode.degrees, episode.motor_seconds,
-        episode.compute_seconds,
+        episode.compute_seconds, float(chosen.double().mean()) if len(chosen) else None,
     )  # fmt: skip
 
 
@@ -135,10 +137,14 @@ def saccade_rows(episode: Episode) -> list[tuple[Any, ...]]:
     """An episode's course, in the order of SACCADE_COLUMNS from saccade (counted from 1) on."""
     local = episode.local_information
     columns = (*episode.gaze, episode.range_m, episode.reward, episode.gap, episode.regret, episode.global_information)
+    aims, nothing = episode.aimed_m, phantom(episode.aimed_m, episode.range_m)
     return [
-        (t + 1, *(float(c[t]) for c in columns), None if local is None else float(local[t]))
+        (
+            t + 1, *(float(c[t]) for c in columns), None if local is None else float(local[t]), float(aims[t]),
+            int(nothing[t]),
+        )
         for t in range(len(episode.gap))
-    ]
+    ]  # fmt: skip
 
 
 def summarize(rows: list[tuple[Any, ...]]) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchfovea.gaussian import columns
 from torchfovea.setting import require
 
-__all__ = ["Eyes", "Gaze", "Head", "clamp_gaze", "cyclopean", "eyes", "fixate", "rig_frame", "to_ego"]
+__all__ = ["Eyes", "Gaze", "Head", "clamp_gaze", "cyclopean", "eyes", "fixate", "gaze_point", "rig_frame", "to_ego"]
 
 
 _FARTHEST_M = 1e12
@@ -202,6 +202,17 @@ def fixate(head: Head, point: Tensor) -> tuple[Gaze, Tensor]:
     reachable = solvable & within
     held = (torch.where(reachable, angle, angle.detach()) for angle in gaze)
     return Gaze(*(torch.where(solvable, angle, torch.zeros_like(angle)) for angle in held)), reachable
+
+
+def gaze_point(head: Head, gaze: Gaze) -> Tensor:
+    """Where both optical axes meet, (..., 3) in E [m]: what `fixate` inverts; infinitely far without vergence.
+
+    Differentiable in the gaze where it converges.
+    """
+    rotation, origin = cyclopean(head, gaze)
+    distance = head.baseline_m / 2 / torch.tan(gaze.vergence / 2)
+    axis = rotation[..., 2]
+    return torch.where(axis == 0, origin, origin + distance[..., None] * axis)
 
 
 def clamp_gaze(head: Head, gaze: Gaze) -> Gaze:
