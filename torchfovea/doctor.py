@@ -81,7 +81,9 @@ def run(cfg: DictConfig) -> None:
         SettingError: for a time limit that is not positive.
     """
     timeout_s = cfg.probe_timeout_s
-    require(isinstance(timeout_s, (int, float)) and timeout_s > 0, "probe_timeout_s", timeout_s, "a positive number")
+    known = isinstance(timeout_s, int | float) and not isinstance(timeout_s, bool)
+    require(known and timeout_s > 0, "probe_timeout_s", timeout_s, "a positive number")
+    require(timeout_s <= 1e6, "probe_timeout_s", timeout_s, "a positive number of seconds, at most 1e6")
     missing = [name for name in REQUIRED if not _version(name)]
     rays, rays_error = _probe(RAYS, timeout_s)
     sgbm, sgbm_error = _probe(SGBM, timeout_s)

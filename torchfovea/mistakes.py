@@ -123,6 +123,8 @@ def _composition(error: HydraException, overrides: Sequence[str], known: Iterabl
         return f"{_given(name, overrides)}: expected a known setting{closest(name, known)}"
     if isinstance(cause, OmegaConfBaseException):
         return _configuration(cause, overrides) or _first_line(error)
+    if unknown := re.match(r"Could not override '([^'@]+)", str(error)):  # a group that the command does not have
+        return f"{_given(unknown[1], overrides)}: expected a known setting{closest(unknown[1], known)}"
     return _first_line(error)
 
 

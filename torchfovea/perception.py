@@ -54,8 +54,9 @@ class Eligibility:
     ground_z_m: float = 0.05
 
     def __post_init__(self) -> None:
-        """Raise SettingError for a negative distance."""
-        require(self.nearest_m >= 0, "eligibility.nearest_m", self.nearest_m, "at least 0 metres")
+        """Raise SettingError for a negative distance, and numbers that are not finite."""
+        require(0 <= self.nearest_m < math.inf, "eligibility.nearest_m", self.nearest_m, "at least 0 metres")
+        require(math.isfinite(self.ground_z_m), "eligibility.ground_z_m", self.ground_z_m, "a finite height in metres")
 
 
 @dataclass(frozen=True)

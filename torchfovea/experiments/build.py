@@ -50,6 +50,7 @@ def build_sensor(cfg: DictConfig) -> tuple[Camera, Retina]:
     fov_deg = typed(cfg.sensor.fov_deg, "float", "sensor.fov_deg")
     widest = 180 if kind == "pinhole" else 360
     require(0 < fov_deg < widest, "sensor.fov_deg", fov_deg, f"more than 0 and less than {widest} for a {kind} camera")
+    require(fov_deg >= 1e-3, "sensor.fov_deg", fov_deg, "at least 0.001 degrees")
     retina: Retina = (
         construct(LogPolar, cfg.sensor, "sensor") if layout == "log_polar" else construct(Uniform, cfg.sensor, "sensor")
     )

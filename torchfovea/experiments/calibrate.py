@@ -21,6 +21,7 @@ from torchfovea.experiments.calibration_report import bins, print_figures, regio
 from torchfovea.experiments.pairs import gaze_of, load_pair, named_pair
 from torchfovea.experiments.progress import progress_bar
 from torchfovea.experiments.truths import Truths, look_at_pair, look_at_world
+from torchfovea.experiments.unread import refuse_unread
 from torchfovea.files import write_csv, write_result
 from torchfovea.sensing.correspondence import Budget
 from torchfovea.sensing.head import Gaze, Head, fixate
@@ -60,6 +61,7 @@ class Split(NamedTuple):
 
 def run(cfg: DictConfig) -> float:
     """Calibrate; the mixture's negative log-likelihood of what was judged on is what a sweeper sees."""
+    refuse_unread("sensor.sample")
     cfg = _sized(cfg)
     scenes, judged_scenes = whole(cfg, "scenes", 0), whole(cfg, "judged_scenes")
     looks, seed = whole(cfg, "looks"), whole(cfg, "seed", 0)

@@ -19,6 +19,7 @@ from torchfovea.experiments.build import build_sensor, construct, number, whole
 from torchfovea.experiments.honesty import CHUNK, plan_cases, plan_planes, propagate, realise, wholes
 from torchfovea.experiments.manifest import complete, finished
 from torchfovea.experiments.progress import progress_bar
+from torchfovea.experiments.unread import refuse_unread
 from torchfovea.files import write_csv
 from torchfovea.sensing.correspondence import Budget
 from torchfovea.sensing.layout import LogPolar, Uniform
@@ -48,6 +49,7 @@ FULL = {"distances": 20, "vergences": 31, "propagation.samples": 1 << 20, "reali
 
 def run(cfg: DictConfig) -> float:
     """Characterize both sensors; the smallest advantage of the foveal one is what a sweeper sees."""
+    refuse_unread("budget.source", "budget.sigma_points")
     cfg = _sized(cfg)
     printed = _sensors(cfg)
     full = {name: _with(sensor, _budget(cfg, whole(cfg, "sensor.source_px", 16))) for name, sensor in printed.items()}

@@ -38,7 +38,7 @@ Row = dict[str, Any]
 def run(cfg: DictConfig) -> float:
     """Run or resume a reproduction; the number of claims that hold is what a sweeper sees."""
     folder = run_folder()
-    whole(cfg, "episodes", 2)
+    whole(cfg, "episodes", 2), whole(cfg, "saccades"), whole(cfg, "seed", 0), whole(cfg, "workers")
     whole(cfg, "memory.cells")
     whole(cfg, "sensor.receptive_fields", 16)
     done = finished(cfg, folder, "claims_hold")

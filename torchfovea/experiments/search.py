@@ -43,7 +43,7 @@ def run(cfg: DictConfig) -> float:
     episodes, saccades, seed = whole(cfg, "episodes"), whole(cfg, "saccades"), whole(cfg, "seed", 0)
     observer, folder = build_observer(cfg), run_folder()
     choice(cfg, "fidelity", ("photometric", "geometric"))
-    choice(cfg, "motor", ("instant", "physics"))
+    choice(cfg, "motor", ("instant", "physics")), choice(cfg, "renderer.name", ("rays", "gl"))
     device_of(cfg), sample_of(cfg), whole(cfg, "batch"), whole(cfg, "workers"), number(cfg, "far_m")
     number(cfg, "near_target_m"), build_stop(cfg)
     require(isinstance(cfg.picture, bool), "picture", cfg.picture, "true or false")

@@ -18,6 +18,7 @@ from torchfovea.experiments.build import build_matcher, build_sensor, choice
 from torchfovea.experiments.images import write_ply
 from torchfovea.experiments.pairs import Pair, gaze_of, load_pair
 from torchfovea.experiments.sense_report import beside, figures_of, read_map
+from torchfovea.experiments.unread import refuse_unread
 from torchfovea.files import replacing, write_result
 from torchfovea.gaussian import Gaussian
 from torchfovea.sensing.chart import cartesian_from_inverse_range
@@ -55,6 +56,7 @@ class Sensed(NamedTuple):
 
 def run(cfg: DictConfig) -> float | None:
     """Sense a pair; the median depth error is what a sweeper sees, if there is truth."""
+    refuse_unread("sensor.fov_deg", "sensor.camera", "sensor.sample")
     every = choice(cfg, "sensor.layout", ("log_polar", "uniform", "every_pixel")) == "every_pixel"
     retina = None if every else build_sensor(cfg)[1]  # the field of view is the images' own
     matcher, budget = build_matcher(cfg), build_budget(cfg, pair=True)

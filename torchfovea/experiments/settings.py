@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any, TypeVar
 
 from omegaconf import DictConfig, OmegaConf
@@ -12,6 +13,9 @@ from torchfovea.setting import require
 __all__ = ["choice", "construct", "number", "typed", "whole"]
 
 T = TypeVar("T")
+
+MOST = 10_000_000
+MOST_SEED = 2**32 - 1
 
 
 def construct(kind: type[T], node: DictConfig | dict[str, Any], where: str) -> T:
@@ -44,12 +48,13 @@ def typed(value: Any, kind: str, setting: str) -> Any:
         pair = not isinstance(value, str) and hasattr(value, "__len__") and len(value) == 2
         require(pair, setting, value, "two numbers, [least, most]")
         return tuple(typed(v, "float", setting) for v in value)
-    number = isinstance(value, int | float) and not isinstance(value, bool)
+    number = isinstance(value, int | float) and not isinstance(value, bool) and value == value
     if kind == "float":
         require(number, setting, value, "a number")
         return float(value)
     if kind == "int":
-        require(number and float(value).is_integer(), setting, value, "a whole number")
+        whole = number and abs(value) < math.inf and float(value).is_integer()
+        require(whole, setting, value, "a whole number")
         return int(value)
     require(
         kind not in ("bool", "str") or type(value).__name__ == kind,
@@ -68,15 +73,18 @@ def choice(cfg: DictConfig, setting: str, options: tuple[str, ...]) -> str:
 
 
 def whole(cfg: DictConfig, setting: str, least: int = 1) -> int:
-    """A whole number no smaller than `least`, read at a dotted name."""
+    """A whole number no smaller than `least`, nor larger than any machine can do, read at a dotted name."""
     value = typed(OmegaConf.select(cfg, setting), "int", setting)
+    most = MOST_SEED if setting.endswith("seed") else MOST
     require(value >= least, setting, value, f"at least {least}")
+    require(value <= most, setting, value, f"{least} to {most}")
     return int(value)
 
 
 def number(cfg: DictConfig, setting: str) -> float:
-    """A positive number, read at a dotted name."""
+    """A positive number of a size that float32 can square, read at a dotted name."""
     given = OmegaConf.select(cfg, setting)
     value = float(typed(given, "float", setting))
     require(value > 0, setting, given, "a positive number")
+    require(1e-9 <= value <= 1e9, setting, given, "a positive number, 1e-9 to 1e9")
     return value

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,9 @@ from torchfovea.config import run_folder
 from torchfovea.experiments.build import build_observer, construct, number, whole
 from torchfovea.experiments.manifest import complete, finished
 from torchfovea.experiments.progress import progress_bar
+from torchfovea.experiments.strategy import read_number
 from torchfovea.experiments.tune_study import check_study, study_curves, study_gradients
+from torchfovea.experiments.unread import refuse_unread
 from torchfovea.files import replacing, write_csv
 from torchfovea.memory.sphere import direction_mixture, sphere_quadrature
 from torchfovea.setting import require
@@ -37,9 +40,15 @@ __all__ = ["build_problem", "build_start", "memory_yaml", "run", "scene_yaml"]
 # what is null in the configuration
 PROFILES = {
     "quick": {"episodes": 512, "validation_scenes": 128, "heldout_scenes": 256, "check_episodes": 256},
-    "full": {"episodes": 2048, "validation_scenes": 256, "heldout_scenes": 1024, "check_episodes": 4096},
+    "reduced": {"episodes": 2048, "validation_scenes": 256, "heldout_scenes": 1024, "check_episodes": 4096},
     "paper": {"episodes": 8192, "validation_scenes": 512, "heldout_scenes": 4096, "check_episodes": 16384},
 }
+# of groups that are shared with search: the simulator of tuning has exact encoders, no matcher and no fusion of patches
+UNREAD = (
+    "head.encoder_deg", "sensor.sample", "budget.bend", "budget.gap", "budget.claim", "fusion.gate_deg",
+    "fusion.gate_spacing", "fusion.fill", "fusion.conflict", "fusion.erode", "fusion.half_life", "prior.slope_std",
+    "prior.bearing_std",
+)  # fmt: skip
 _FIELD_SCENES = 512
 _FIELD_DIRECTIONS = 4000  # on the whole sphere
 _FIELD_ALPHAS = (0.1, 0.3, 1.0)
@@ -48,27 +57,23 @@ _FIELD_ALPHAS = (0.1, 0.3, 1.0)
 def build_problem(cfg: DictConfig) -> Problem:
     """What is tuned, from a configuration."""
     node: Any = OmegaConf.to_container(cfg.distribution, resolve=True)
-    regions = node.pop("regions")
+    regions = node.pop("regions", None)
     rows = isinstance(regions, list) and all(isinstance(row, list) and len(row) == 4 for row in regions)
     require(rows, "distribution.regions", regions, "a list of [azimuth low, high, elevation low, high]")
-    settings: dict[str, Any] = {"regions": tuple(map(tuple, regions))}
-    whole_numbers = ("cans", "tries")
-    for name, value in node.items():
-        settings[name] = tuple(value) if isinstance(value, list) else value
-        if name in whole_numbers:
-            settings[name] = whole(cfg, f"distribution.{name}")
-    unknown = sorted(set(settings) - set(Distribution.__dataclass_fields__))
+    unknown = sorted(set(node) - set(Distribution.__dataclass_fields__))
     require(not unknown, "distribution", unknown, "settings of a scene distribution only")
-    try:
-        distribution = Distribution(**settings)
-    except TypeError as error:
-        require(False, "distribution", settings["name"], f"numbers where numbers belong ({error})")
-        raise
+    for region in regions:
+        for value in region:
+            known = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+            require(known, "distribution.regions", region, "four numbers of degrees")
+    distribution = replace(construct(Distribution, node, "distribution"), regions=tuple(map(tuple, regions)))
     task = Task(build_observer(cfg), whole(cfg, "saccades", 2), number(cfg, "far_m"), str(cfg.metric))
-    alpha = OmegaConf.select(cfg, "acquisition.alpha")
     require(cfg.acquisition.name == "ucb", "acquisition", cfg.acquisition.name, "ucb, whose alpha is tuned")
+    alpha = read_number(cfg, "acquisition.alpha", "a number of at least 0", 0.0)
+    for setting in ("tune_alpha", "tune_fov", "prior_field"):
+        require(isinstance(cfg[setting], bool), setting, cfg[setting], "true or false")
     fov_deg = float(cfg.sensor.fov_deg) if cfg.tune_fov else None
-    shape = Shape(whole(cfg, "components"), distribution.conditioned, bool(cfg.tune_alpha), float(alpha), fov_deg)
+    shape = Shape(whole(cfg, "components"), distribution.conditioned, cfg.tune_alpha, alpha, fov_deg)
     return Problem(task, distribution, shape, whole(cfg, "memory.cells", 2))
 
 
@@ -109,6 +114,7 @@ def run(cfg: DictConfig) -> float:
 def _run(cfg: DictConfig) -> float:
     profile = PROFILES[str(HydraConfig.get().runtime.choices["profile"])]
     sizes = {name: value if cfg[name] is None else whole(cfg, name) for name, value in profile.items()}
+    refuse_unread(*UNREAD)
     check_study(cfg)
     problem = build_problem(cfg)
     start, folder = build_start(cfg, problem.shape), run_folder()
@@ -118,7 +124,8 @@ def _run(cfg: DictConfig) -> float:
     schedule = construct(Schedule, merged, "tune")
     checkpoint = folder / "checkpoint.pt"
     if cfg.resume is not None:
-        require(Path(cfg.resume).is_file(), "resume", cfg.resume, "a checkpoint.pt that exists")
+        there = isinstance(cfg.resume, str) and Path(cfg.resume).is_file()
+        require(there, "resume", cfg.resume, "a checkpoint.pt that exists")
     before = finished(cfg, folder, "heldout.tuned.gap_per_saccade")
     if before is not None:
         return before

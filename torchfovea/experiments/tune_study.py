@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from torchfovea.experiments.build import whole
@@ -61,6 +61,8 @@ def _read(path: Path, columns: tuple[str, ...]) -> list[list[str]]:
 def check_study(cfg: DictConfig) -> None:
     """Raise SettingError for a study, a method or an estimator that there is none of."""
     require(cfg.study in (None, "curves", "gradients"), "study", cfg.study, "null, curves or gradients")
+    for name in ("methods", "estimators"):
+        require(OmegaConf.is_list(cfg[name]), name, cfg[name], "a list, [...]")
     check_methods([str(method) for method in cfg.methods])
     for name in cfg.estimators:
         require(name in ESTIMATORS, "estimators", name, "any of " + ", ".join(ESTIMATORS))

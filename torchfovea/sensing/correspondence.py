@@ -197,16 +197,18 @@ class Budget:
     def __post_init__(self) -> None:
         """Raise SettingError for impossible numbers."""
         require(
-            0 < self.sigma_over_width < math.inf, "sensor.sigma_over_width", self.sigma_over_width, "a positive number"
+            1e-9 <= self.sigma_over_width <= 1e6,
+            "budget.sigma_over_width",
+            self.sigma_over_width,
+            "a positive number, 1e-9 to 1e6",
         )
         require(
             self.source_px is None or self.source_px > 0, "sensor.source_px", self.source_px, "a positive number of px"
         )
-        require(0 <= self.match_px < math.inf, "sensor.match_px", self.match_px, "0 or more source pixels")
         for field in fields(self):
-            if field.name not in ("sigma_over_width", "source_px", "match_px"):
+            if field.name not in ("sigma_over_width", "source_px"):
                 value = getattr(self, field.name)
-                require(0 <= value < math.inf, f"budget.{field.name}", value, "0 or more")
+                require(0 <= value <= 1e6, f"budget.{field.name}", value, "0 to 1e6")
         for name in ("outliers", "shared"):
             require(getattr(self, name) < 1, f"budget.{name}", getattr(self, name), "a share, less than 1")
         least = f"0 or more and not above budget.shared = {self.shared:g}"

@@ -18,6 +18,7 @@ from torchfovea.setting import require
 
 __all__ = ["LogPolar", "Retina", "Uniform", "cortical"]
 
+MOST = 10_000_000  # RFs of a retina
 BUDGET_TOLERANCE = 0.005  # a layout's count may differ from its budget by this share
 ASPECT_TOLERANCE = 5.0  # an RF may be at most so many times longer than wide, or wider than long
 
@@ -216,7 +217,8 @@ def _require_disc(receptive_fields: int, radius_px: float) -> None:
     require(
         whole and receptive_fields >= 16, "sensor.receptive_fields", receptive_fields, "a whole number, at least 16"
     )
-    require(0 < radius_px < math.inf, "sensor.radius_px", radius_px, "a positive number of pixels")
+    require(receptive_fields <= MOST, "sensor.receptive_fields", receptive_fields, f"16 to {MOST}")
+    require(1e-6 <= radius_px <= 1e6, "sensor.radius_px", radius_px, "a positive number of pixels, 1e-6 to 1e6")
 
 
 @lru_cache(maxsize=256)

@@ -77,6 +77,8 @@ class SGBM:
         require(self.mode in MODES, "matcher.mode", self.mode, f"one of {', '.join(MODES)}")
         whole = self.disparities is None or (self.disparities > 0 and self.disparities % 16 == 0)
         require(whole, "matcher.disparities", self.disparities, "a positive multiple of 16")
+        few = self.disparities is None or self.disparities <= 16384
+        require(few, "matcher.disparities", self.disparities, "a positive multiple of 16, at most 16384")
         require(0 <= self.texture < math.inf, "matcher.texture", self.texture, "0 or more grey levels")
         fov = self.rectified_fov_deg
         require(0 < fov <= 160, "matcher.rectified_fov_deg", fov, "more than 0 and at most 160 degrees")

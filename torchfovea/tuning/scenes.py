@@ -98,7 +98,11 @@ class Distribution:
             require(ordered, f"distribution.{name}", pair, f"(low, high) within {low} to {high}")
             object.__setattr__(self, name, pair)
         require(0 <= self.margin_m <= 5, "distribution.margin_m", self.margin_m, "0 to 5 metres")
-        require(self.tries >= 1, "distribution.tries", self.tries, "at least 1")
+        for name in ("front_m", "back_m", "side_m", "height_m"):
+            require(
+                0.1 <= getattr(self, name) <= 1000, f"distribution.{name}", getattr(self, name), "0.1 to 1000 metres"
+            )
+        require(1 <= self.tries <= 10**6, "distribution.tries", self.tries, "1 to 1000000")
 
     def region_of(self, a: float, e: float) -> tuple[float, float, float, float]:
         """Where the target of a conditioned task (a, e) in [-1, 1]² may stand, as one of `regions`."""
