@@ -73,6 +73,64 @@ def test_every_command_shows_its_settings(name, capsys, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_help_has_the_comments_of_the_settings(capsys):
+    assert main(["search", "--help"]) == 0
+    said = capsys.readouterr().out
+    assert "# photometric: images, matched; geometric: surface points by ray casting" in said
+    assert "# fusion=aligned|inverse_range|printed; now inverse_range" in said and "  gate_deg: 0.8" in said
+    assert "hydra:" not in said and "defaults:" not in said and "@package" not in said
+
+
+@pytest.mark.skipif(os.name != "posix", reason="pipes are POSIX")
+@pytest.mark.parametrize("arguments", [["--help"], ["search", "--help"]])
+def test_a_reader_that_leaves_early_is_no_error(arguments, tmp_path):
+    command = [sys.executable, "-m", "torchfovea", *arguments]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    read, write = os.pipe()
+    os.close(read)  # nobody reads at all
+    try:
+        done = subprocess.run(
+            command, stdout=write, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment, timeout=240
+        )
+    finally:
+        os.close(write)
+    assert (done.returncode, done.stderr) == (1, "")
+
+
+def test_flags_may_stand_anywhere_and_unknown_ones_are_named(job, capsys):
+    job("return float(cfg.seed)")
+    assert main(["doctor", "probe_timeout_s=2", "-m", "seed=0,1"]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 3
+    for flags, said in (
+        (["--hlp"], "--hlp: expected SETTING=VALUE, or a flag such as --help (did you mean --help?)"),
+        (["seed=1", "--config-dir"], "--config-dir = nothing: expected a value after it"),
+    ):
+        assert main(["doctor", *flags]) == 2
+        assert capsys.readouterr().err == f"torchfovea doctor: {said}\n"
+
+
+def test_a_broken_file_of_a_group_is_named(job, capsys, tmp_path):
+    (tmp_path / "budget").mkdir()
+    (tmp_path / "budget" / "broken.yaml").write_text("sigma_over_width: [1\n  bad: : x\n")
+    assert main(["search", "--config-dir", str(tmp_path), "budget=broken"]) == 1
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1 and "broken.yaml" in said and "line 2" in said
+
+
+def test_a_package_that_the_end_needs_is_missed_at_the_beginning(job, capsys, monkeypatch):
+    """Without matplotlib a search would find out after its episodes."""
+    from torchfovea import mistakes
+
+    find = mistakes.importlib.util.find_spec
+    monkeypatch.setattr(mistakes.importlib.util, "find_spec", lambda n: None if n == "matplotlib" else find(n))
+    COMMANDS["doctor"] = COMMANDS["doctor"]._replace(draws=True)
+    job_ran = []
+    monkeypatch.setattr("torchfovea.files.write_result", lambda *a: job_ran.append(a))
+    fails_with(capsys, "matplotlib is not installed: expected the extra viz (pip install 'torchfovea[viz]')")
+    assert not job_ran
+    assert main(["doctor", "+picture=false"]) == 0
+
+
 def test_unknown_command(capsys):
     assert main(["docter"]) == 2
     names = ", ".join(COMMANDS)

@@ -62,6 +62,8 @@ def test_a_killed_sweep_resumes_to_the_same_table(whole, tmp_path, capsys):
     assert {path: path.stat().st_mtime_ns for path in done} == done  # nothing complete was made again
     assert len(list(folder.rglob("result.json"))) == 12
     assert table(folder) == table(whole)
+    shown = capsys.readouterr().out
+    assert "acquisition" in shown and "gap_per_saccade" in shown and "collect.csv: 12 runs, " in shown
 
 
 def test_no_worker_outlives_a_killed_command():

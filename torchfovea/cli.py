@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import importlib
+import io
 import logging
 import os
 import shutil
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, redirect_stdout
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,6 +26,7 @@ class Command(NamedTuple):
     summary: str
     example: str
     resumes: bool = False
+    draws: bool = False
 
 
 # A command NAME is a function of its composed configuration conf/NAME.yaml; what it returns is the score that
@@ -35,29 +37,34 @@ COMMANDS: dict[str, Command] = {
         "find the nearest object by saccades, and map the scene: the main job",
         "torchfovea search scene=cans sensor=uniform acquisition.alpha=2",
         resumes=True,
+        draws=True,
     ),
     "sense": Command(
         "torchfovea.experiments.sense:run",
         "a stereo pair in, 3-D points with covariances out",
         "torchfovea sense pair=motorcycle",
+        draws=True,
     ),
     "characterize": Command(
         "torchfovea.experiments.characterize:run",
         "what two eyes know of planes, foveal and uniform (Fig. 5), and how far to believe it",
         "torchfovea characterize profile=quick",
         resumes=True,
+        draws=True,
     ),
     "tune": Command(
         "torchfovea.experiments.tune:run",
         "learn the memory's bias and alpha by gradient on simulated episodes",
         "torchfovea tune profile=quick distribution=left_below",
         resumes=True,
+        draws=True,
     ),
     "reproduce": Command(
         "torchfovea.experiments.reproduce:run",
         "the paper's figures and claims, measured again, with intervals and verdicts",
         "torchfovea reproduce profile=quick",
         resumes=True,
+        draws=True,
     ),
     "collect": Command(
         "torchfovea.experiments.collect:run",
@@ -68,6 +75,7 @@ COMMANDS: dict[str, Command] = {
         "torchfovea.experiments.calibrate:run",
         "is the claimed uncertainty true? fit the error budget and judge it",
         "torchfovea calibrate real=true",
+        draws=True,
     ),
     "memory": Command(
         "torchfovea.experiments.memory:run",
@@ -96,7 +104,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         The exit status: 0, 1 for a run that failed, 2 for an unknown command, 130 after Ctrl-C.
     """
-    chosen, *overrides = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    try:
+        status = _dispatch(list(sys.argv[1:] if arguments is None else arguments) or ["--help"])
+        sys.stdout.flush()
+        return status
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        # The reader of our output has gone; leave nothing for the interpreter to flush at its exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+
+
+def _dispatch(arguments: list[str]) -> int:
+    chosen, *overrides = arguments
     if chosen in ("-h", "--help"):
         print(_help())
         return 0
@@ -108,15 +130,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         _complain("torchfovea", f"command = {chosen}: expected one of {', '.join(COMMANDS)}{closest(chosen, COMMANDS)}")
         return 2
-    try:
-        return _run(chosen, overrides)
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return 130
-    except BrokenPipeError:
-        # The reader of our output has gone; leave nothing for the interpreter to flush at its exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
+    return _run(chosen, overrides)
 
 
 def _help() -> str:
@@ -162,9 +176,19 @@ def _close_logs() -> None:
 def _run(command: str, overrides: list[str]) -> int:
     import hydra
 
-    from torchfovea.config import SweepFolder, conf_dir
-    from torchfovea.mistakes import describe
+    from torchfovea.config import SweepFolder, conf_dir, help_text
+    from torchfovea.mistakes import arranged, describe
+    from torchfovea.setting import SettingError
 
+    try:
+        overrides = arranged(overrides)
+    except SettingError as error:
+        _complain(f"torchfovea {command}", str(error))
+        return 2
+    if set(overrides) & {"-h", "--help"} and not any(o.startswith(("--config", "-c")) for o in overrides):
+        print(f"torchfovea {command} [setting=value ...]: {COMMANDS[command].summary}")
+        print(help_text(command))
+        return 0
     full_error = os.environ.get("HYDRA_FULL_ERROR") == "1"
     SweepFolder.latest = None
     status = 0
@@ -174,6 +198,8 @@ def _run(command: str, overrides: list[str]) -> int:
             app(_job(command, overrides, full_error))()
         except JobFailed:
             status = 1
+        except BrokenPipeError:
+            raise
         except SystemExit as stop:
             status = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
         except Exception as error:
@@ -206,7 +232,7 @@ def _job(command: str, overrides: list[str], full_error: bool) -> Callable[[Any]
 
         from torchfovea.config import run_folder
         from torchfovea.experiments.manifest import MANIFEST, record, unclaimed, withdraw
-        from torchfovea.mistakes import describe
+        from torchfovea.mistakes import describe, need
 
         folder = run_folder()
         settings = HydraConfig.get().job
@@ -217,8 +243,14 @@ def _job(command: str, overrides: list[str], full_error: bool) -> Callable[[Any]
             taken = COMMANDS[command].resumes and (folder / "result.json").exists()
             if not (taken or (folder / MANIFEST).exists()):
                 record(cfg, folder)
+            if COMMANDS[command].draws and cfg.get("picture", True):
+                need("matplotlib")
             module, _, function = COMMANDS[command].target.partition(":")
-            score = getattr(importlib.import_module(module), function)(cfg)
+            # of a sweep's jobs only the folders are printed; each job's tables are in them
+            with redirect_stdout(io.StringIO()) if sweeping else nullcontext():
+                score = getattr(importlib.import_module(module), function)(cfg)
+        except BrokenPipeError:
+            raise
         except Exception as error:
             if full_error:
                 raise

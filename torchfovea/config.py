@@ -9,7 +9,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
-__all__ = ["SweepFolder", "conf_dir", "run_folder"]
+__all__ = ["SweepFolder", "conf_dir", "help_text", "run_folder"]
 
 
 def conf_dir() -> str:
@@ -21,6 +21,38 @@ def conf_dir() -> str:
 def run_folder() -> Path:
     """The running job's own folder (Hydra made it); only inside a job."""
     return Path(HydraConfig.get().runtime.output_dir)
+
+
+def help_text(command: str) -> str:
+    """A command's groups and settings as its YAML files have them, with their comments."""
+    from hydra import compose, initialize_config_dir
+
+    folder = Path(conf_dir())
+    with initialize_config_dir(str(folder), version_base="1.3"):
+        choices = compose(command, return_hydra_config=True).hydra.runtime.choices
+    parts = []
+    for group, chosen in choices.items():
+        if (folder / str(group)).is_dir():
+            options = "|".join(sorted(path.stem for path in (folder / str(group)).glob("*.yaml")))
+            text = _shown(folder / str(group) / f"{chosen}.yaml") if chosen else ""
+            inside = "" if text.startswith("# @package _global_") else "  "
+            body = "\n".join(f"{inside}{line}" for line in text.splitlines() if not line.startswith("# @package"))
+            parts.append(f"# {group}={options}; now {chosen}\n" + (f"{group}:\n" if inside and text else "") + body)
+    shared = [line for line in _shown(folder / "base.yaml").splitlines() if not line.startswith("#")]
+    parts += ["\n".join(shared), _shown(folder / f"{command}.yaml")]
+    last = "--multirun with setting=a,b,... runs every combination; --hydra-help shows what Hydra itself can do."
+    return "\n\n".join([*(part.strip("\n") for part in parts if part.strip()), last])
+
+
+def _shown(path: Path) -> str:
+    """A YAML file without its list of defaults and Hydra's own settings."""
+    lines, hidden = [], False
+    for line in path.read_text(encoding="utf-8").splitlines():
+        if line and not line[0].isspace():
+            hidden = line.startswith(("defaults:", "hydra:"))
+        if not hidden:
+            lines.append(line)
+    return "\n".join(lines)
 
 
 class SweepFolder(Callback):

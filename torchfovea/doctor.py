@@ -22,11 +22,12 @@ from torchfovea.setting import require
 __all__ = ["Finding", "run"]
 
 # What the defaults need, and what each of the others is for.
-REQUIRED = ("torch", "kornia", "mujoco", "numpy", "scipy", "filterpy", "hydra-core")
+REQUIRED = ("torch", "kornia", "numpy", "scipy", "filterpy", "hydra-core", "rich")
+DEFAULTS = ("mujoco", "matplotlib")
 OPTIONAL = {
+    "mujoco": "simulated worlds: pip install 'torchfovea[sim]'",
     "opencv-python-headless": "the default matcher: pip install 'torchfovea[stereo]'",
     "matplotlib": "pictures: pip install 'torchfovea[viz]'",
-    "rich": "progress bars and tables: pip install 'torchfovea[viz]'",
     "scikit-image": "sense pair=motorcycle: pip install 'torchfovea[samples]'",
     "hydra-joblib-launcher": "sweeps on all cores: pip install 'torchfovea[sweep]'",
     "hydra-submitit-launcher": "sweeps on a cluster: pip install 'torchfovea[sweep]'",
@@ -92,6 +93,7 @@ def run(cfg: DictConfig) -> None:
     backends = [gl] if isinstance(gl, str) else [str(name) for name in gl or []]
     compiler = _compiler()
     cuda = torch.cuda.is_available()
+    missing += [name for name in DEFAULTS if not _version(name)]  # OpenCV goes by several names: the probe tells
     ok = not missing and rays is True and sgbm is True
 
     findings = [
@@ -107,7 +109,7 @@ def run(cfg: DictConfig) -> None:
         Finding("configuration", conf_dir(), ""),
     ]
     _show(findings)
-    print("The defaults (rays and SGBM) can run." if ok else "The defaults (rays and SGBM) cannot run: see above.")
+    print(f"The defaults (rays, SGBM, pictures) can{'' if ok else 'not'} run{'.' if ok else ': see above.'}")
     folder = run_folder()
     write_csv(folder / "doctor.csv", Finding._fields, findings)
     write_result(
@@ -153,14 +155,9 @@ def _probe(program: str, timeout_s: float) -> tuple[Any, str]:
 
 
 def _show(findings: Sequence[Finding]) -> None:
-    try:
-        from rich.console import Console
-        from rich.table import Table
-    except ModuleNotFoundError:
-        widths = [max(len(row[column]) for row in findings) for column in (0, 1)]
-        for row in findings:
-            print(f"{row.item:<{widths[0]}}  {row.found or '-':<{widths[1]}}  {row.note}".rstrip())
-        return
+    from rich.console import Console
+    from rich.table import Table
+
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     for row in findings:
         table.add_row(row.item, row.found or "-", row.note, style=None if row.found else "dim")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import difflib
+import importlib.util
 import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+import yaml
 from hydra.errors import (
     HydraException,
     InstantiationException,
@@ -23,15 +25,21 @@ from omegaconf.errors import (
     ValidationError,
 )
 
-from torchfovea.setting import SettingError
+from torchfovea.setting import SettingError, require
 
-__all__ = ["closest", "describe", "setting_names"]
+__all__ = ["arranged", "closest", "describe", "need", "setting_names"]
+
+# Hydra's own flags: with a value, and without
+VALUED = ("--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd", "--package", "-p", "--cfg", "-c",
+          "--experimental-rerun")  # fmt: skip
+PLAIN = ("--help", "-h", "--hydra-help", "--run", "-r", "--multirun", "-m", "--resolve", "--shell-completion", "-sc")
+INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
 
 # The extra that brings each optional module.
 EXTRAS = {
     "cv2": "stereo",
     "matplotlib": "viz",
-    "rich": "viz",
+    "mujoco": "sim",
     "skimage": "samples",
     "cma": "tune",
     "optuna": "tune",
@@ -42,6 +50,44 @@ def closest(name: str, names: Iterable[str]) -> str:
     """A hint at the nearest of ``names``, or an empty string where none is near."""
     near = difflib.get_close_matches(name, list(names), n=1)
     return f" (did you mean {near[0]}?)" if near else ""
+
+
+def arranged(arguments: Sequence[str]) -> list[str]:
+    """A command's arguments with Hydra's flags first: its parser takes settings on one side of them only.
+
+    Raises:
+        SettingError: for a flag that there is none of, or that lacks its value.
+    """
+    flags, settings, rest = [], [], list(arguments)
+    while rest:
+        argument = rest.pop(0)
+        name, equals, _ = argument.partition("=")
+        if not argument.startswith("-"):
+            settings.append(argument)
+        elif name in VALUED:
+            require(bool(equals or rest), name, "nothing", "a value after it")
+            flags += [argument] if equals else [argument, rest.pop(0)]
+        elif name in ("--info", "-i"):
+            flags += [argument] if equals else [argument, rest.pop(0) if rest and rest[0] in INFO else "all"]
+        else:
+            known = (*PLAIN, *VALUED, "--info")
+            if argument not in PLAIN:
+                raise SettingError(
+                    f"{argument}: expected SETTING=VALUE, or a flag such as --help{closest(name, known)}"
+                )
+            flags.append(argument)
+    return [*flags, *settings]
+
+
+def need(*modules: str) -> None:
+    """Refuse to begin a work whose end needs a package that is not there.
+
+    Raises:
+        ModuleNotFoundError: for the first that is missing; `describe` names its extra.
+    """
+    for module in modules:
+        if importlib.util.find_spec(module) is None:
+            raise ModuleNotFoundError(f"No module named '{module}'", name=module)
 
 
 def setting_names(cfg: DictConfig) -> list[str]:
@@ -76,6 +122,8 @@ def describe(error: BaseException, overrides: Sequence[str], known: Iterable[str
         line = str(error)
     elif isinstance(error, OmegaConfBaseException):
         line = _configuration(error, overrides)
+    elif isinstance(error, yaml.MarkedYAMLError):
+        line = f"{error.problem_mark or error.context_mark or 'a file'}: {error.problem}: expected YAML"
     elif isinstance(error, ModuleNotFoundError):
         line = _missing_module(error)
     elif isinstance(error, OSError):

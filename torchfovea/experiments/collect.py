@@ -7,6 +7,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
+from rich.table import Table
 
 from torchfovea.config import run_folder
 from torchfovea.experiments.manifest import MANIFEST, read_result
@@ -14,6 +15,8 @@ from torchfovea.files import write_csv, write_result
 from torchfovea.setting import SettingError, require
 
 __all__ = ["run"]
+
+FIGURES = 6  # shown on the screen
 
 
 def run(cfg: DictConfig) -> float:
@@ -36,9 +39,23 @@ def run(cfg: DictConfig) -> float:
     require(bool(rows), "dir", source, "a folder with at least one complete run")
     columns = list(dict.fromkeys(key for row in rows for key in row))
     folder = run_folder()
+    _show(columns, rows)
     write_csv(folder / "collect.csv", columns, [[row.get(key) for key in columns] for row in rows])
     write_result(folder, {"rows": len(rows), "unfinished": len(unfinished), "corrupt": len(corrupt)})
     return float(len(rows))
+
+
+def _show(columns: list[str], rows: list[dict[str, Any]]) -> None:
+    """The table's settings and first figures; the file has them all."""
+    words = [c for c in columns if any(isinstance(row.get(c), str) for row in rows)]
+    figures = [c for c in columns if c not in words][:FIGURES]
+    table = Table(*words, *figures, box=None, padding=(0, 2, 0, 0))
+    for row in rows:
+        cells = (row.get(c) for c in (*words, *figures))
+        table.add_row(*("-" if v is None else f"{v:.4g}" if isinstance(v, float) else str(v) for v in cells))
+    console = Console()
+    (console if console.is_terminal else Console(width=200)).print(table, markup=False)
+    print(f"collect.csv: {len(rows)} runs, {len(columns)} columns")
 
 
 def _say(line: str) -> None:
