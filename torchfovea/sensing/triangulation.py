@@ -207,8 +207,7 @@ def observe(
     support = support_px / camera.focal_px * torch.addcmul(torch.addcmul(z * z, x, x), y, y).rsqrt()
     mean, cov = value[:3].movedim(0, -1), value[3:].movedim(0, -1)
     inlier = valid.to(mean.dtype) if matches.inlier is None else matches.inlier
-    support = torch.where(valid, support, torch.ones_like(support))
-    return Observations(mean, cov, direction.movedim(0, -1), support, valid, inlier)
+    return Observations(mean, cov, direction.movedim(0, -1), support.expand(valid.shape), valid, inlier)
 
 
 def _safe(
@@ -312,6 +311,4 @@ def _settled(
         gone = 1 - keep.to(ahead.dtype)
     value = torch.stack([*first, *second])
     unit = value.new_tensor([1.0, 1, 1, 1, 0, 0, 1, 0, 1]).reshape(-1, *[1] * gone.dim())
-    forward = direction.new_tensor([1.0, 0, 0]).reshape(-1, *[1] * gone.dim())
-    value = torch.addcmul((value * (1 - gone)).nan_to_num(0.0, 0.0, 0.0), unit, gone)
-    return value, torch.where(keep, direction, forward), keep
+    return torch.addcmul((value * (1 - gone)).nan_to_num(0.0, 0.0, 0.0), unit, gone), direction, keep

@@ -188,13 +188,18 @@ def moments_of_differences(delta: Sequence[Tensor], points: SigmaPoints) -> tupl
     if points.by_axis:
         # with the even part e = δ₊ + δ₋ and the odd part o = δ₊ − δ₋ of an axis, its quadrature's covariance is
         # w (δ₊δ₊ᵀ + δ₋δ₋ᵀ) − w² e eᵀ = w/2 (o oᵀ + (1 − 2w) e eᵀ): squares alone, for w ≤ 1/2
-        halves = [d.unflatten(0, (2, -1)).unbind(0) for d in delta]
-        even, odd = [a + b for a, b in halves], [a - b for a, b in halves]
-        scale = weight / 2 * (1 - 2 * weight)
-        second = [
-            ((odd[i] * odd[j]).sum(0) * (weight / 2)).add_((even[i] * even[j]).sum(0), alpha=scale) for i, j in pairs
-        ]
-        return [e.sum(0) * weight for e in even], second
+        rows, shift = [], []
+        for ahead, behind in (d.unflatten(0, (2, -1)).unbind(0) for d in delta):
+            even = ahead + behind
+            shift.append(even.sum(0) * weight)
+            rows.append([*(ahead - behind).unbind(0), *(even * (1 - 2 * weight) ** 0.5).unbind(0)])
+        second = []
+        for i, j in pairs:
+            total = rows[i][0] * rows[j][0]
+            for a, b in zip(rows[i][1:], rows[j][1:], strict=True):
+                total.addcmul_(a, b)
+            second.append(total * (weight / 2))
+        return shift, second
     # with s = w Σ δ, Σ w (δ − s)(δ − s)ᵀ = w Σ δ δᵀ + (Σ w_c − 2) s sᵀ, the sum of the weights with the centre's
     rest = sum(weights_cov) - 2
     shift = [component.sum(0) * weight for component in delta]
