@@ -29,6 +29,7 @@ from torchfovea.sensing.retina import Retina, fovea, interpolate
 from torchfovea.setting import require
 from torchfovea.stereo.confidence import read_clues
 from torchfovea.stereo.costs import left_eye
+from torchfovea.stereo.exposure import alike
 from torchfovea.stereo.readings import refine_reading
 from torchfovea.stereo.rig import StereoRig, posed, verged
 from torchfovea.stereo.sgbm import SGBM, disparity_sgbm
@@ -81,7 +82,7 @@ def match_sgbm(
             without OpenCV.
     """
     params, budget = params or SGBM(), budget or Budget()
-    pair = grey_pair(left, right)
+    pair = alike(grey_pair(left, right))
     check_range(nearest_range_m, farthest_range_m)
     size = min(pair.shape[-2:])
     budget = budget if budget.source_px is None else replace(budget, source_px=size)

@@ -20,6 +20,7 @@ from torchfovea.sensing.retina import Retina, fovea, interpolate
 from torchfovea.setting import require
 from torchfovea.stereo.confidence import read_clues
 from torchfovea.stereo.costs import left_eye
+from torchfovea.stereo.exposure import alike
 from torchfovea.stereo.matching import (
     check_range,
     correspondences,
@@ -80,7 +81,7 @@ def match_rectified(
         SettingError: as `match_sgbm`, and for cameras that are not rectified.
     """
     params = params or SGBM()
-    pair = grey_pair(left, right)
+    pair = alike(grey_pair(left, right))
     check_range(nearest_range_m, farthest_range_m)
     height, width = pair.shape[-2:]
     doffs = _doffs(camera_left, camera_right, baseline_m)
