@@ -22,6 +22,7 @@ from omegaconf.errors import (
     OmegaConfBaseException,
     ValidationError,
 )
+from yaml import YAMLError
 
 from torchfovea.setting import SettingError
 
@@ -78,6 +79,8 @@ def describe(error: BaseException, overrides: Sequence[str], known: Iterable[str
         line = _configuration(error, overrides)
     elif isinstance(error, ModuleNotFoundError):
         line = _missing_module(error)
+    elif isinstance(error, YAMLError):
+        line = _broken(error)
     elif isinstance(error, OSError):
         line = _file(error, overrides)
     else:
@@ -156,6 +159,12 @@ def _missing_module(error: ModuleNotFoundError) -> str | None:
         return None
     extra = EXTRAS[module]
     return f"{module} is not installed: expected the extra {extra} (pip install 'torchfovea[{extra}]')"
+
+
+def _broken(error: YAMLError) -> str:
+    mark = getattr(error, "problem_mark", None)
+    where = "configuration" if mark is None else f"{mark.name}, line {mark.line + 1}"
+    return f"{where}: expected YAML ({getattr(error, 'problem', None) or _first_line(error)})"
 
 
 def _file(error: OSError, overrides: Sequence[str]) -> str:

@@ -138,7 +138,7 @@ class Kinship(NamedTuple):
 class Budget:
     """What limits a correspondence, as variances that add up, and how probably it is one at all.
 
-    An error is N(0, σ²) with probability p and anything that was searched with 1 − p. Per eye and axis
+    An error is N(0, σ²) with probability p; with 1 − p the match is anywhere on its line. Per eye and axis
 
         σ² = (s W)² + (s p)² + (m p)²,   m² = match_px² + (bend b)² + (gap g)² + (fringe f)² + (noise n)²,
 
