@@ -30,6 +30,7 @@ FLOORS = (
         "semiglobal",
         "costs",
         "subpixel",
+        "exposure",
         "readings",
         "surfaces",
         "sweep",

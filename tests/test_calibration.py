@@ -14,8 +14,10 @@ import scipy.stats
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from synthetic import LINE, observations, without_clues
 
 from torchfovea.cli import main
+from torchfovea.experiments.regions import REGIONS
 from torchfovea.sensing.camera import Fisheye, Pinhole
 from torchfovea.sensing.correspondence import Budget, Clues, Correspondences, Disparity, eye_sigma_px
 from torchfovea.sensing.geometric import correspond_points
@@ -27,85 +29,111 @@ from torchfovea.stereo.confidence import BLOCK_PX, read_clues
 from torchfovea.stereo.matching import correspondences
 from torchfovea.stereo.rectified import match_disparity
 from torchfovea.studies.calibration import (
-    Judged,
-    Likelihood,
     concatenate,
-    fit_budget,
+    inlier_of,
     judge,
     judged,
     mixture_nll,
+    reliability,
     select,
     sigma_of,
 )
+from torchfovea.studies.fitting import Likelihood, fit_budget, least_match_px
 
 RETINA = LogPolar(3000)
-
-
-def observations(count, budget, seed=0, outliers=0.0):
-    """Errors drawn from a budget's own law; a share of them ten times as wide."""
-    rng = np.random.default_rng(seed)
-    spread = {
-        "left_gain": rng.uniform(0.01, 0.1, count), "right_gain": rng.uniform(0.01, 0.1, count),
-        "left_width_px": rng.uniform(0.1, 4, count), "right_width_px": rng.uniform(0.1, 4, count),
-        "pixel_px": np.full(count, 0.5), "bend_px": rng.exponential(2, count) * (rng.random(count) < 0.4),
-        "gap_px": rng.exponential(3, count) * (rng.random(count) < 0.3), "claim_px": rng.exponential(0.5, count),
-        "range_m": rng.uniform(0.5, 1.5, count), "eccentricity_rad": rng.uniform(0, 1, count),
-    }  # fmt: skip
-    data = Judged(torch.zeros(count), *(torch.as_tensor(spread[name]) for name in Judged._fields[1:]))
-    wide = np.where(rng.random(count) < outliers, 10.0, 1.0)
-    return data._replace(error=sigma_of(data, budget) * torch.as_tensor(wide * rng.normal(size=count)))
 
 
 # ------------------------------------------------------------------------------------------------------------- the fit
 
 
-@pytest.mark.parametrize("fit_outliers", [False, True])
-def test_a_known_budget_is_recovered(fit_outliers):
-    true = Budget(0.12, 400, 0.3, bend=0.5, gap=0.25, claim=1.7)
-    data = observations(40_000, true, outliers=0.02)
-    fit = fit_budget([data], Budget(), Likelihood(fit_outliers=fit_outliers))
-    for name in ("sigma_over_width", "match_px", "bend", "gap", "claim"):
-        assert getattr(fit.budget, name) == pytest.approx(getattr(true, name), rel=0.05), name
-    assert fit.outlier_share == pytest.approx(0.02, abs=0.004)
+def test_a_known_budget_is_recovered():
+    spread = {"bend": 0.5, "gap": 0.25, "fringe": 0.3, "noise": 0.8, "claim": 1.7}
+    odds = {"outliers_bend": 0.6, "outliers_gap": 0.8, "outliers_fringe": 0.4, "outliers_hidden": 1.0}
+    true = Budget(0.12, 400, 0.3, **spread, outliers=0.03, **odds, outliers_mismatch=2.0)
+    sets = [observations(40_000, true, seed) for seed in range(8)]
+    fit = fit_budget(sets, Budget())
+    for name in ("sigma_over_width", "match_px", *spread):
+        assert getattr(fit.budget, name) == pytest.approx(getattr(true, name), rel=0.1), name
+    for name in (*odds, "outliers_mismatch"):
+        assert getattr(fit.budget, name) == pytest.approx(getattr(true, name), rel=0.25), name
+    assert fit.budget.outliers == pytest.approx(0.03, abs=0.008)
     assert fit.loss < fit.first_loss and fit.budget.source_px == 400
+    # what the fit claims is true: its own probabilities, on observations that it never saw
+    fresh = observations(60_000, true, seed=99)
+    claimed, real = inlier_of(fresh, fit.budget), inlier_of(fresh, true)
+    assert (claimed - real).abs().mean() < 0.02
+    rows = reliability(fresh, sigma_of(fresh, fit.budget), claimed, [0, 0.6, 0.8, 0.9, 1])
+    assert sum(row[2] for row in rows) == 60_000 and [row[1] for row in rows] == [0.6, 0.8, 0.9, 1]
+    # some wild ones fall within 3 sigma
+    lucky = (6 * sigma_of(fresh, fit.budget) / LINE).clamp(max=1)
+    for low, high, count, p, near in rows:
+        row = (claimed > low) & (claimed <= high)
+        expected = 0.9973 * claimed[row] + lucky[row] * (1 - claimed[row])
+        assert p == pytest.approx(claimed[row].mean().item())
+        assert near == pytest.approx(expected.mean().item(), abs=0.02 + 2 / math.sqrt(count))
+
+
+def test_outliers_that_are_not_fitted_keep_their_share():
+    true = Budget(0.12, 400, 0.3, claim=0.0, outliers=0.02)
+    data = without_clues(observations(20_000, true))
+    fit = fit_budget([data], Budget(), Likelihood(fit_outliers=False))
+    assert fit.budget.outliers == pytest.approx(0.02) and fit.budget.outliers_bend == 0
+    assert fit.budget.match_px == pytest.approx(0.3, rel=0.1)
 
 
 def test_a_fit_repeats_and_leaves_alone_what_no_observation_tells():
-    true = Budget(0.2, 400, 0.1)
-    data = observations(2000, true)
-    zero = torch.zeros_like(data.error)
-    plain = data._replace(bend_px=zero, gap_px=zero, claim_px=zero)
-    start = Budget(bend=0.7, gap=0.0, claim=0.9)
+    plain = without_clues(observations(2000, Budget(0.2, 400, 0.1)))
+    start = Budget(bend=0.7, gap=0.0, claim=0.9, outliers_gap=0.4)
     one, other = fit_budget([plain], start), fit_budget([plain], start)
     assert one == other
-    assert (one.budget.bend, one.budget.gap, one.budget.claim) == (0.7, 0.0, 0.9)
+    assert (one.budget.bend, one.budget.gap, one.budget.claim, one.budget.outliers_gap) == (0.7, 0.0, 0.9, 0.4)
 
 
 def test_each_set_weighs_the_same():
     narrow, wide = observations(500, Budget(0.1, 400, 0.1)), observations(5000, Budget(0.3, 400, 0.3), seed=1)
-    both = fit_budget([narrow, wide])
-    again = fit_budget([concatenate([narrow] * 3), wide])
-    assert both.budget.sigma_over_width == pytest.approx(again.budget.sigma_over_width, rel=1e-4)
+    both = fit_budget([narrow, wide]).budget.sigma_over_width
+    assert both == pytest.approx(fit_budget([wide, concatenate([narrow] * 3)]).budget.sigma_over_width, rel=0.1)
+
+
+def test_a_set_weighs_by_area():
+    """Narrow fields that err much and cover nothing do not decide."""
+    wide = without_clues(observations(3000, Budget(0.1, 400, 0.1)))
+    wide = wide._replace(left_width_px=torch.full_like(wide.error, 3.0))
+    wide = wide._replace(
+        error=sigma_of(wide, Budget(0.1, 400, 0.1)) * torch.randn(3000, generator=torch.Generator().manual_seed(0))
+    )
+    narrow = wide._replace(left_width_px=torch.full_like(wide.error, 0.01), error=50 * wide.error)
+    fit = fit_budget([concatenate([wide, narrow, narrow])])
+    assert fit.budget.sigma_over_width == pytest.approx(fit_budget([wide]).budget.sigma_over_width, rel=0.15)
+
+
+def test_a_truth_in_steps_leaves_sigma_its_width():
+    data = without_clues(observations(3000, Budget(0.05, 400, 0.0)))
+    data = data._replace(error=torch.zeros_like(data.error) + 1e-9)
+    fit = fit_budget([data], least_match=least_match_px(1 / 3))
+    assert fit.budget.match_px >= least_match_px(1 / 3) == pytest.approx(1 / 3 / math.sqrt(12) / math.sqrt(2))
 
 
 def test_the_likelihood_has_the_right_gradient():
     torch.manual_seed(0)
     error, variance = torch.randn(6, dtype=torch.float64), torch.rand(6, dtype=torch.float64) + 0.1
-    share = torch.tensor(0.05, dtype=torch.float64)
+    share = torch.tensor(0.95, dtype=torch.float64)
     inputs = tuple(t.requires_grad_() for t in (error, variance, share))
-    assert torch.autograd.gradcheck(lambda e, v, s: mixture_nll(e, v, s, 10.0), inputs)
-    far = mixture_nll(torch.tensor([1e4], requires_grad=True), torch.tensor([1e-6]), torch.tensor(0.01), 10.0)
-    assert torch.isfinite(torch.autograd.grad(far.sum(), far)[0]).all() and torch.isfinite(far).all()
+    assert torch.autograd.gradcheck(lambda e, v, s: mixture_nll(e, v, s, torch.tensor(4.0)), inputs)
+    for p in (0.99, 1.0):
+        far = mixture_nll(
+            torch.tensor([1e4], requires_grad=True), torch.tensor([1e-6]), torch.tensor(p), torch.tensor(4.0)
+        )
+        assert torch.isfinite(torch.autograd.grad(far.sum(), far)[0]).all() and torch.isfinite(far).all()
 
 
-@given(st.floats(-30, 30), st.floats(0.01, 10), st.floats(0.001, 0.4), st.floats(1.5, 50))
-def test_the_likelihood_against_scipy(error, sigma, share, inflation):
-    pair = [math.log(1 - share), math.log(share)], [sigma, inflation * sigma]
-    expected = -scipy.special.logsumexp(
-        [w + scipy.stats.norm.logpdf(error, scale=s) for w, s in zip(*pair, strict=True)]
-    )
-    tensors = [torch.tensor(v, dtype=torch.float64) for v in (error, sigma**2, share)]
-    assert mixture_nll(*tensors, inflation).item() == pytest.approx(expected, rel=1e-9, abs=1e-9)
+@given(st.floats(-30, 30), st.floats(0.01, 10), st.floats(0.001, 1.0), st.floats(0.1, 50))
+def test_the_likelihood_against_scipy(error, sigma, inlier, line):
+    terms = [math.log(inlier) + scipy.stats.norm.logpdf(error, scale=sigma)]
+    terms += [math.log1p(-inlier) - math.log(line)] if inlier < 1 else []
+    tensors = [torch.tensor(v, dtype=torch.float64) for v in (error, sigma**2, inlier, line)]
+    expected = -scipy.special.logsumexp(terms)
+    assert mixture_nll(*tensors).item() == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
 # ------------------------------------------------------------------------------------------------------------- judging
@@ -128,16 +156,26 @@ def test_an_honest_gaussian_is_judged_honest():
     data = observations(60_000, budget, seed=4)
     level = torch.full_like(data.left_gain, 0.05)  # one σ for all, so that medians are those of one Gaussian
     data = data._replace(left_gain=level, right_gain=level, left_width_px=level, right_width_px=level)
-    zero = torch.zeros_like(level)
-    data = data._replace(bend_px=zero, gap_px=zero, claim_px=zero, range_m=torch.ones_like(level))
+    data = without_clues(data)._replace(range_m=torch.ones_like(level))
     sigma = sigma_of(data, budget)
     noise = torch.randn(len(level), generator=torch.Generator().manual_seed(0), dtype=level.dtype)
     found = judge(data._replace(error=sigma * noise), sigma)
+    assert found["inlier_share"] == found["inlier_mean"] == 1 and found["mixture_nll"] == pytest.approx(found["nll"])
     assert found["nees_mean"] == pytest.approx(1, abs=0.02)
     assert found["coverage_50"] == pytest.approx(0.5, abs=0.01) and found["coverage_95"] == pytest.approx(
         0.95, abs=0.005
     )
     assert found["interval_over_error"] == pytest.approx(1.96 / 0.6745, rel=0.02)
+
+
+def test_weights_are_repetitions():
+    data = observations(400, Budget(outliers=0.1), seed=5)
+    times = torch.arange(400) % 3
+    again = select(data, torch.repeat_interleave(torch.arange(400), times))
+    claims = [(sigma_of(d, Budget()), inlier_of(d, Budget(outliers=0.3, outliers_bend=1.0))) for d in (data, again)]
+    weighted, repeated = judge(data, *claims[0], times), judge(again, *claims[1])
+    for name in weighted.keys() - {"ause"}:
+        assert weighted[name] == pytest.approx(repeated[name]), name
 
 
 def test_selecting_and_joining():
@@ -218,7 +256,8 @@ def test_unknown_truth_is_left_out_and_nothing_is_an_error():
     ("make", "line"),
     [
         (lambda: Likelihood(outlier_share=0.0), r"fit\.outlier_share = 0"),
-        (lambda: Likelihood(inflation=1.0), r"fit\.inflation = 1"),
+        (lambda: Budget(outliers=1.0), r"budget\.outliers = 1\.0"),
+        (lambda: Budget(outliers_gap=-1.0), r"budget\.outliers_gap = -1"),
         (lambda: Budget(bend=-1.0), r"budget\.bend = -1"),
         (lambda: Budget(gap=math.inf), r"budget\.gap = inf"),
         (lambda: Budget(claim=math.nan), r"budget\.claim = nan"),
@@ -338,8 +377,11 @@ def test_the_motorcycle_alone_and_its_budget_used(folder, capsys):
     run, result = calibrate(capsys, "scenes=0", "real=true", *small)
     for name in FIGURES:
         assert math.isfinite(result[f"before.{name}"]) and math.isfinite(result[f"after.{name}"])
-    assert result["after.nll"] < result["before.nll"]
+    assert result["after.mixture_nll_by_area"] < result["before.mixture_nll_by_area"]
     assert 0.9 < result["after.coverage_95"] < 0.98
+    assert 0 < result["after.inlier_mean"] < 1 == result["before.inlier_mean"]
+    assert sum(result[f"after.{region}.share_by_area"] for region in REGIONS) == pytest.approx(1)
+    assert result["after.edge.coverage_95_by_area"] < result["after.smooth.coverage_95_by_area"]
     assert {"result.json", "bins.csv", "calibration.png", "budget"} <= {p.name for p in run.iterdir()}
     rows = list(csv.DictReader((run / "bins.csv").read_text().splitlines()))
     whole = [row for row in rows if row["range_from_m"] == row["eccentricity_from_deg"] == ""]
@@ -348,14 +390,14 @@ def test_the_motorcycle_alone_and_its_budget_used(folder, capsys):
     assert int(whole[0]["observations"]) == result["observations"]
     assert main(["sense", "--config-dir", str(run), "budget=fitted", "pair=motorcycle", *small]) == 0
     sensed = json.loads((Path(capsys.readouterr().out.splitlines()[-1]) / "result.json").read_text())
-    assert 0.9 < sensed["coverage_95"] < 0.98
+    assert 0.9 < sensed["coverage_95"] < 0.98 and 0 < sensed["inlier_mean"] < 1
 
 
 def test_simulated_scenes(folder, capsys):
     sizes = "scenes=1", "judged_scenes=1", "looks=1", "sensor.receptive_fields=3000", "sensor.source_px=200"
     run, result = calibrate(capsys, *sizes)
-    assert result["after.nll"] < result["before.nll"] and result["observations"] > 1000
-    assert 0.9 < result["after.coverage_95"] <= 0.99
+    assert result["after.mixture_nll"] < result["before.mixture_nll"] and result["observations"] > 1000
+    assert 0.9 < result["after.coverage_95_by_area"] <= 0.99  # the fit weighs by area
     again = calibrate(capsys, *sizes)[1]
     assert again == result
     text = (run / "budget" / "fitted.yaml").read_text()
@@ -365,11 +407,15 @@ def test_simulated_scenes(folder, capsys):
 @pytest.mark.parametrize(
     ("overrides", "line"),
     [
-        (["scenes=0"], "scenes = 0: expected at least 1, or real=true"),
+        (["scenes=0"], "scenes = 0: expected at least 1, real=true or pairs"),
+        (["pairs=art"], "pairs = art: expected a list"),
+        (["scenes=0", "pairs=[nowhere]"], "pairs[0] = nowhere: expected motorcycle, or a folder"),
+        (["scenes=0", "pairs=[3]"], "pairs[0] = 3: expected motorcycle, or a folder"),
+        (["fovs_deg=[90, 60]"], "fovs_deg = [90, 60]: expected ascending numbers"),
         (["real=maybe"], "real = maybe: expected true or false"),
         (["looks=0"], "looks = 0"),
         (["judged_scenes=0"], "judged_scenes = 0"),
-        (["fit.inflation=0.5"], "fit.inflation = 0.5"),
+        (["fit.outlier_share=0.5"], "fit.outlier_share = 0.5"),
         (["range_edges_m=[2, 1]"], "range_edges_m = [2, 1]: expected two or more ascending numbers"),
         (["matcher.name=magic"], "matcher.name = magic"),
         (["OWN"], "disparity = null: expected the true disparity"),

@@ -1,6 +1,7 @@
 """`torchfovea sense`: the real pair, a user's own files, and errors."""
 
 import json
+import math
 from pathlib import Path
 
 import cv2
@@ -57,6 +58,20 @@ def test_the_motorcycle(folder, capsys):
     points = np.load(run / "points.npz")
     assert len(points["mean_m"]) == result["points"] and np.isfinite(points["cov_m2"]).all()
     assert 1.5 < np.median(points["mean_m"][:, 2]) < 5
+    assert len(points["inlier"]) == result["points"] and ((points["inlier"] > 0) & (points["inlier"] <= 1)).all()
+    # no two points look at one source pixel
+    pixel = np.round(points["left_px"] * 500 / 200)
+    assert len(np.unique(pixel, axis=0)) == len(pixel)
+    assert result["valid_fraction"] != result["valid_fraction_by_area"] and 0 < result["hidden_valid_by_area"] < 1
+    assert result["coverage_95_by_area"] < result["coverage_95"] and math.isfinite(result["nll_by_area"])
+
+
+def test_points_survive_a_judgement_that_fails(folder, capsys, plane):
+    """A truth of another sign: nothing lies within 5 standard deviations, and the points are there."""
+    np.save("wrong.npy", np.full(SIZE, 150, np.float32))
+    run, result = sense(capsys, *plane, "disparity=wrong.npy", "sensor.receptive_fields=4000", "matcher=sgbm")
+    assert len(np.load(run / "points.npz")["mean_m"]) == result["points"] > 500
+    assert result["valid_fraction"] > 0.5 and result.get("outlier_share", 1) == 1
 
 
 @pytest.mark.parametrize("sensor", ["log_polar", "uniform", "every_pixel"])
@@ -87,6 +102,21 @@ def test_offset_axes_are_the_same_geometry(folder, capsys, plane):
         (["OWN", "focal_px=wide"], "focal_px = wide: expected a number"),
         (["OWN", "disparity=left.png"], "disparity = left.png: expected a disparity map"),
         (["OWN", "disparity=half.npy"], "disparity = (80, 100)"),
+        (["OWN", "cx_px=[1,2]"], "cx_px = [1, 2]: expected a number"),
+        (["OWN", "cx_px=nan"], "cx_px = nan: expected a number"),
+        (["OWN", "cy_px=1e9"], "cy_px = 1000000000.0: expected a number of pixels within 100 images"),
+        (["OWN", "focal_px=1e300"], "focal_px = 1e+300: expected a positive number of pixels"),
+        (["OWN", "focal_px=1e-300"], "focal_px = 1e-300: expected a positive number of pixels"),
+        (["OWN", "baseline_m=1e300"], "baseline_m = 1e+300: expected a positive number of metres"),
+        (["OWN", "doffs_px=null"], "doffs_px = None: expected a number"),
+        (["OWN", "doffs_px=[]"], "doffs_px = []: expected a number"),
+        (["OWN", "doffs_px=1e9"], "doffs_px = 1000000000.0: expected a number of pixels within"),
+        (["OWN", "gaze_px=5"], "gaze_px = 5: expected [column, row]"),
+        (["OWN", "gaze_px=[5]"], "gaze_px = [5]: expected [column, row]"),
+        (["OWN", "gaze_px=[5,a]"], "gaze_px = [5, 'a']: expected [column, row]"),
+        (["OWN", "gaze_px=[500,5]"], "gaze_px = [500, 5]: expected [column, row]"),
+        (["OWN", "left=1"], "left = 1: expected a file's name"),
+        (["OWN", "disparity=0"], "disparity = 0: expected a file's name"),
     ],
 )
 def test_a_mistake_is_one_line_and_leaves_nothing(folder, capsys, plane, overrides, line):
@@ -129,11 +159,11 @@ def test_disparity_files(tmp_path):
 
 def test_ply_reads_back(tmp_path):
     rng = np.random.default_rng(0)
-    mean, cov, colour = rng.normal(size=(5, 3)), rng.random((5, 6)), rng.random((5, 3))
-    write_ply(tmp_path / "p.ply", mean, cov, colour)
+    mean, cov, colour, inlier = rng.normal(size=(5, 3)), rng.random((5, 6)), rng.random((5, 3)), rng.random(5)
+    write_ply(tmp_path / "p.ply", mean, cov, colour, inlier)
     head, body = (tmp_path / "p.ply").read_bytes().split(b"end_header\n")
-    assert b"element vertex 5" in head and b"property float cov_zz" in head and b"property uchar blue" in head
-    record = np.dtype([("f", "<f4", 9), ("c", "u1", 3)])
+    assert b"element vertex 5" in head and b"property float inlier" in head and b"property uchar blue" in head
+    record = np.dtype([("f", "<f4", 10), ("c", "u1", 3)])
     read = np.frombuffer(body, record)
-    np.testing.assert_allclose(read["f"], np.concatenate([mean, cov], -1), rtol=1e-6)
+    np.testing.assert_allclose(read["f"], np.concatenate([mean, cov, inlier[:, None]], -1), rtol=1e-6)
     np.testing.assert_array_equal(read["c"], (colour * 255).round())

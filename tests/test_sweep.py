@@ -143,7 +143,7 @@ def test_what_the_right_eye_cannot_see_is_mostly_rejected():
     hidden = ~seen & (right.norm(dim=-1) < 90)
     assert hidden.sum() > 50
     assert matches.valid[seen & (right.norm(dim=-1) < 90)].double().mean() > 0.93
-    unchecked, _ = match_sweep(*room.images(200), room.rig, room.camera, retina, Sweep(left_right_widths=math.inf))
+    unchecked, _ = match_sweep(*room.images(200), room.rig, room.camera, retina, Sweep(left_right=False))
     assert matches.valid[hidden].double().mean() < 0.6 * unchecked.valid[hidden].double().mean()
 
 
@@ -333,7 +333,7 @@ def test_bad_input_is_named():
             match_sweep(*images, rig, camera, retina, **options)
     for name, value in {
         "window": 0, "refine_window": 4, "per_width": 0.0, "hypotheses": 3, "smooth_small": -1.0, "smooth_large": 0.1,
-        "correlation": 1.0, "uniqueness": -0.1, "contrast": 0.0, "noise": 0.0, "left_right_widths": 0.0,
+        "correlation": 1.0, "uniqueness": -0.1, "contrast": 0.0, "noise": 0.0,
         "winner_widths": 0.0, "temperature": 0.0, "volume_sigmas": 0.0,
     }.items():  # fmt: skip
         with pytest.raises(SettingError, match=f"matcher.{name}"):

@@ -24,6 +24,7 @@ from omegaconf.errors import (
     OmegaConfBaseException,
     ValidationError,
 )
+from yaml import YAMLError
 
 from torchfovea.setting import SettingError, require
 
@@ -126,6 +127,8 @@ def describe(error: BaseException, overrides: Sequence[str], known: Iterable[str
         line = f"{error.problem_mark or error.context_mark or 'a file'}: {error.problem}: expected YAML"
     elif isinstance(error, ModuleNotFoundError):
         line = _missing_module(error)
+    elif isinstance(error, YAMLError):
+        line = _broken(error)
     elif isinstance(error, OSError):
         line = _file(error, overrides)
     else:
@@ -206,6 +209,12 @@ def _missing_module(error: ModuleNotFoundError) -> str | None:
         return None
     extra = EXTRAS[module]
     return f"{module} is not installed: expected the extra {extra} (pip install 'torchfovea[{extra}]')"
+
+
+def _broken(error: YAMLError) -> str:
+    mark = getattr(error, "problem_mark", None)
+    where = "configuration" if mark is None else f"{mark.name}, line {mark.line + 1}"
+    return f"{where}: expected YAML ({getattr(error, 'problem', None) or _first_line(error)})"
 
 
 def _file(error: OSError, overrides: Sequence[str]) -> str:

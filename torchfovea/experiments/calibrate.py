@@ -71,7 +71,7 @@ def run(cfg: DictConfig) -> float:
     budget = build_budget(cfg)
     start = replace(budget, source_px=whole(cfg, "sensor.source_px", 16))
     matcher, folder = build_matcher(cfg), run_folder()
-    likelihood = construct(Likelihood, {**cfg.fit, "nearest_m": matcher.nearest_m}, "fit")
+    likelihood = construct(Likelihood, cfg.fit, "fit")
     edges = _edges(cfg, "range_edges_m"), _edges(cfg, "eccentricity_edges_deg")
     angles = _edges(cfg, "fovs_deg", least=1) if len(cfg.fovs_deg) else [float(cfg.sensor.fov_deg)]
     data: dict[str, Split] = {}
@@ -97,7 +97,7 @@ def run(cfg: DictConfig) -> float:
         prefix = "" if kind == next(iter(data)) else f"{kind}."
         area = split.judged.area()
         for model, law in models[kind].items():
-            claims = sigma_of(split.judged, law), inlier_of(split.judged, law), matcher.nearest_m
+            claims = sigma_of(split.judged, law), inlier_of(split.judged, law)
             for suffix, weight in (("", None), ("_by_area", area)):
                 for name, value in judge(split.judged, *claims, weight).items():
                     figures[f"{prefix}{model}.{name}{suffix}"] = value
@@ -109,7 +109,7 @@ def run(cfg: DictConfig) -> float:
     numbers = {name: value for name, value in asdict(after).items() if name != "source_px"}
     figures |= {f"fit.{name}": value for name, value in numbers.items()}
     figures |= {"fit.loss": found.loss, "fit.first_loss": found.first_loss}
-    write_csv(folder / "bins.csv", *bins({k: s.judged for k, s in data.items()}, models, matcher.nearest_m, *edges))
+    write_csv(folder / "bins.csv", *bins({k: s.judged for k, s in data.items()}, models, *edges))
     write_csv(folder / "reliability.csv", *table({k: s.judged for k, s in data.items()}, models))
     from torchfovea.pictures.calibration import draw_calibration
 

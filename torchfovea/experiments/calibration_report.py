@@ -36,14 +36,14 @@ PROBABILITIES = (0.0, 0.2, 0.4, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 1.0)
 LEAST_IN_BIN = 50
 
 
-def regions_of(data: Judged, sigma: Tensor, inlier: Tensor, nearest_m: float) -> dict[str, float]:
+def regions_of(data: Judged, sigma: Tensor, inlier: Tensor) -> dict[str, float]:
     """Figures by region and area, and the region's share of the area; regions with few observations left out."""
     figures, area = {}, data.area()
     for k, name in enumerate(REGIONS):
         here = data.region == k
         figures[f"{name}.share_by_area"] = float((area * here).sum() / area.sum())
         if int(here.sum()) >= LEAST_IN_BIN:
-            found = judge(select(data, here), sigma[here], inlier[here], nearest_m, area[here])
+            found = judge(select(data, here), sigma[here], inlier[here], area[here])
             figures |= {f"{name}.{figure}_by_area": found[figure] for figure in IN_REGIONS}
     return figures
 
@@ -51,7 +51,6 @@ def regions_of(data: Judged, sigma: Tensor, inlier: Tensor, nearest_m: float) ->
 def bins(
     data: Mapping[str, Judged],
     models: Mapping[str, Mapping[str, Budget]],
-    nearest_m: float,
     ranges: list[float],
     eccentricities: list[float],
 ) -> tuple[tuple[str, ...], list[tuple[Any, ...]]]:
@@ -66,7 +65,7 @@ def bins(
                 part, count = select(judged, mask), int(mask.sum())
                 for model, law in models[kind].items():
                     enough = count >= LEAST_IN_BIN
-                    found = judge(part, sigma_of(part, law), inlier_of(part, law), nearest_m) if enough else {}
+                    found = judge(part, sigma_of(part, law), inlier_of(part, law)) if enough else {}
                     bounds = *(low_high or (None, None)), *(inner_outer or (None, None))
                     rows.append((kind, model, *bounds, count, *(found.get(name) for name in FIGURES)))
     return BIN_COLUMNS, rows

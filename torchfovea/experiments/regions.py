@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -64,6 +66,6 @@ def truth_step_px(disparity: Tensor) -> float:
     return float(values.diff().median()) if len(values) > 1 else 0.0
 
 
-def _pooled(pool, values: Tensor, side: int) -> Tensor:  # type: ignore[no-untyped-def]
+def _pooled(pool: Callable[..., Any], values: Tensor, side: int) -> Tensor:
     padded = torch.nn.functional.pad(values[None, None], [side // 2] * 4, mode="replicate")
     return torch.as_tensor(pool(padded, side, 1)[0, 0])

@@ -64,6 +64,8 @@ class Disparity(NamedTuple):
         camera: the left view's.
         doffs_px: disparity of a point at infinity, negated (cx_right − cx_left): depth = focal · baseline/(d + doffs).
         baseline_m: distance between the eyes.
+        rival_px: (H, W), by how much another surface's disparity differs that claims the same place of the right view;
+            0: none does; None: not asked.
         clues: of the readings at the receptive fields, (N,); None for a map that nobody read.
     """
 
@@ -73,6 +75,7 @@ class Disparity(NamedTuple):
     camera: Pinhole
     doffs_px: float
     baseline_m: float
+    rival_px: Tensor | None = None
     clues: Clues | None = None
 
     def depth_m(self) -> Tensor:
@@ -99,8 +102,8 @@ class Clues(NamedTuple):
             differ by in its window, over the window's gradient energy. Weak texture widens it.
         mismatch: 1 less the correlation of the two windows, 0 to 2: the share of the contrast that the eyes do not
             share, whatever their exposures.
-        hidden_px: disparity by which a nearer surface of the same map stands before the place where the right eye would
-            see the point; 0: nothing does.
+        hidden_px: by how much another surface's disparity differs that claims the place, or one within half a window of
+            it, where the right eye would see the point; 0: none does. One of the two is hidden from the right eye.
     """
 
     bend_px: Tensor
@@ -135,7 +138,7 @@ class Kinship(NamedTuple):
 class Budget:
     """What limits a correspondence, as variances that add up, and how probably it is one at all.
 
-    An error is N(0, σ²) with probability p and anything that was searched with 1 − p. Per eye and axis
+    An error is N(0, σ²) with probability p; with 1 − p the match is anywhere on its line. Per eye and axis
 
         σ² = (s W)² + (s p)² + (m p)²,   m² = match_px² + (bend b)² + (gap g)² + (fringe f)² + (noise n)²,
 

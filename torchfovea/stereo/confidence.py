@@ -40,7 +40,7 @@ def read_clues(disparity: Disparity, place: Tensor, shift: Tensor, width_px: Ten
     Returns:
         Clues (N,): the bend is the largest difference of the reading from the mean of two opposite places, both with a
         disparity, on a circle of radius √(width² + BLOCK_PX²); the fringe is the largest by which it is nearer than
-        that; the gap is that radius times the share of places without.
+        that; the gap is that radius times the share of places without. What is hidden is the map's rivals.
     """
     height, width = disparity.disparity.shape
     values, valid = disparity.disparity.flatten(), disparity.valid.flatten()
@@ -59,7 +59,11 @@ def read_clues(disparity: Disparity, place: Tensor, shift: Tensor, width_px: Ten
         departs = torch.where(one_there & other_there, shift - (one + other) / 2, torch.zeros_like(shift))
         nearer, farther = torch.maximum(nearer, departs), torch.maximum(farther, -departs)
         holes = holes + (~one_there).to(holes) + (~other_there).to(holes)
-    return Clues(torch.maximum(nearer, farther), radius * holes / DIRECTIONS, nearer)
+    clues = Clues(torch.maximum(nearer, farther), radius * holes / DIRECTIONS, nearer)
+    if disparity.rival_px is None:
+        return clues
+    column, row = x.round().clamp(0, width - 1).long(), y.round().clamp(0, height - 1).long()
+    return clues._replace(hidden_px=disparity.rival_px[row, column])
 
 
 @torch.no_grad()

@@ -32,6 +32,7 @@ from torchfovea.stereo.matching import check_range, correspondences, in_range, r
 from torchfovea.stereo.readings import refine_reading
 from torchfovea.stereo.rectified import RectifiedMatch, match_disparity
 from torchfovea.stereo.rig import StereoRig
+from torchfovea.stereo.visibility import undisputed
 
 __all__ = ["External", "Matcher", "load_matcher", "match_external", "match_external_rectified"]
 
@@ -178,6 +179,9 @@ def match_external_rectified(
     trusted = torch.isfinite(disparity)
     if confidence is not None:
         trusted &= confidence >= params.least_confidence
+    grey = _grey(pair)
+    disparity = torch.where(trusted, disparity, torch.zeros_like(disparity)).to(grey)
+    trusted, rival_px = undisputed(grey[0, 0], grey[1, 0], disparity, trusted)
     match = match_disparity(
         disparity,
         camera_left,
@@ -190,16 +194,16 @@ def match_external_rectified(
         nearest_range_m=nearest_range_m,
         farthest_range_m=farthest_range_m,
         edge_px=params.edge_px,
-        pair=_grey(pair),
+        pair=grey,
         move=params.refine,
+        rival_px=rival_px,
     )
     scale = camera_left.focal_px / match.camera_left.focal_px
     left_px = match.correspondences.left_px
     origin = left_px.new_tensor([match.camera_left.cx_px, match.camera_left.cy_px])
     place = (left_px - origin) * scale + left_px.new_tensor([camera_left.cx_px, camera_left.cy_px])
     found = _doubt(match.correspondences, confidence, place, scale, params, (budget or Budget()).claim)
-    grey = pair[0].mean(0).to(disparity)
-    return match._replace(correspondences=found, disparity=match.disparity._replace(image=grey))
+    return match._replace(correspondences=found, disparity=match.disparity._replace(image=pair[0].mean(0)))
 
 
 def match_external(
@@ -265,7 +269,10 @@ def match_external(
     if confidence is not None:
         trusted &= (confidence >= params.least_confidence).to(pair.device)
     disparity = torch.where(trusted, disparity, torch.zeros_like(disparity))
-    field = Disparity(views[0].mean(0), disparity, trusted, view, 0.0, rig.baseline_m)
+    grey = [view.mean(0) for view in views]
+    trusted, rival_px = undisputed(grey[0], grey[1], disparity, trusted)
+    disparity = torch.where(trusted, disparity, torch.zeros_like(disparity))
+    field = Disparity(grey[0], disparity, trusted, view, 0.0, rig.baseline_m, rival_px)
 
     def read(px: Tensor) -> tuple[Tensor, Tensor]:
         directions = camera.rays(px) @ R_left.mT

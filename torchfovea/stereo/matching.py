@@ -29,9 +29,11 @@ from torchfovea.sensing.retina import Retina, fovea, interpolate
 from torchfovea.setting import require
 from torchfovea.stereo.confidence import read_clues
 from torchfovea.stereo.costs import left_eye
+from torchfovea.stereo.exposure import alike
 from torchfovea.stereo.readings import refine_reading
 from torchfovea.stereo.rig import StereoRig, posed, verged
 from torchfovea.stereo.sgbm import SGBM, disparity_sgbm
+from torchfovea.stereo.visibility import undisputed
 
 __all__ = [
     "SGBM",
@@ -80,7 +82,7 @@ def match_sgbm(
             without OpenCV.
     """
     params, budget = params or SGBM(), budget or Budget()
-    pair = grey_pair(left, right)
+    pair = alike(grey_pair(left, right))
     check_range(nearest_range_m, farthest_range_m)
     size = min(pair.shape[-2:])
     budget = budget if budget.source_px is None else replace(budget, source_px=size)
@@ -102,7 +104,9 @@ def match_sgbm(
     rays = view.rays(columns(*torch.broadcast_tensors(column, row[:, None])))
     seen = [camera.project(rays @ R) for R in (R_left, R_right)]
     views = [interpolate(values[i : i + 1], retina, px)[0, 0] for i, px in enumerate(seen)]
-    disparity = dense_disparity(views, search, params, view, 0.0, rig.baseline_m, pad=False)
+    ahead = camera.in_view(rays @ R_left)
+    near = retina.inside(seen[0] * (1 - 2 / size)) & ahead  # a pixel beyond the rim, whose fields are read there, too
+    disparity = dense_disparity(views, search, params, view, 0.0, rig.baseline_m, False, near)
 
     def read(px: Tensor) -> tuple[Tensor, Tensor]:
         directions = camera.rays(px) @ R_left.mT
@@ -123,7 +127,7 @@ def match_sgbm(
     right_px = camera.project(there)
     found &= camera.in_view(there) & retina.inside(right_px)
     # nothing where the left eye does not look
-    looks = retina.inside(seen[0]) & camera.in_view(rays @ R_left)
+    looks = retina.inside(seen[0]) & ahead
     disparity = disparity._replace(image=disparity.image * looks, valid=disparity.valid & looks)
     clues = read_clues(disparity, place, shift, retina.width_px(left_px) * (size / (2 * retina.radius_px)))
     clues = clues._replace(noise_px=reading.noise_px, mismatch=reading.mismatch)
@@ -177,18 +181,15 @@ def dense_disparity(
     doffs_px: float,
     baseline_m: float,
     pad: bool,
+    looks: Tensor | None = None,
 ) -> Disparity:
-    """Match two rectified views (H, W)."""
+    """Match two rectified views (H, W); `looks`, bool (H, W), says where the left eye does, everywhere by default."""
     left, right = (view.float().cpu().numpy() for view in views)
-    disparity, valid = disparity_sgbm(left, right, search, params, pad)
-    return Disparity(
-        views[0],
-        torch.as_tensor(disparity).to(views[0]),
-        torch.as_tensor(valid).to(views[0].device),
-        camera,
-        doffs_px,
-        baseline_m,
-    )
+    found = disparity_sgbm(left, right, search, params, pad)
+    disparity, valid = torch.as_tensor(found[0]).to(views[0]), torch.as_tensor(found[1]).to(views[0].device)
+    valid = valid if looks is None else valid & looks
+    valid, rival_px = undisputed(views[0], views[1], disparity, valid)
+    return Disparity(views[0], disparity, valid, camera, doffs_px, baseline_m, rival_px)
 
 
 def read_disparity(disparity: Disparity, place: Tensor, edge_px: float) -> tuple[Tensor, Tensor]:

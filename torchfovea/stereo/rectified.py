@@ -20,6 +20,7 @@ from torchfovea.sensing.retina import Retina, fovea, interpolate
 from torchfovea.setting import require
 from torchfovea.stereo.confidence import read_clues
 from torchfovea.stereo.costs import left_eye
+from torchfovea.stereo.exposure import alike
 from torchfovea.stereo.matching import (
     check_range,
     correspondences,
@@ -80,7 +81,7 @@ def match_rectified(
         SettingError: as `match_sgbm`, and for cameras that are not rectified.
     """
     params = params or SGBM()
-    pair = grey_pair(left, right)
+    pair = alike(grey_pair(left, right))
     check_range(nearest_range_m, farthest_range_m)
     height, width = pair.shape[-2:]
     doffs = _doffs(camera_left, camera_right, baseline_m)
@@ -88,14 +89,18 @@ def match_rectified(
     # no pixel of the left image can find its like further off than the image is wide
     nearest_px = min(reach / nearest_range_m - doffs, width - 1)
     search = params.search(max(reach / farthest_range_m - doffs, 1 - width), nearest_px)
-    views = list(pair[:, 0])
+    views, looks = list(pair[:, 0]), None
     if retina is not None:
         middle, scale = _gaze(gaze_px, height, width, retina)
         values = fovea(pair, pair.new_tensor([middle, middle]), retina, scale)  # (2, 1, N)
         x = (torch.arange(width, device=pair.device, dtype=pair.dtype) - middle[0]) / scale
         y = (torch.arange(height, device=pair.device, dtype=pair.dtype) - middle[1]) / scale
-        views = list(interpolate(values, retina, columns(*torch.broadcast_tensors(x, y[:, None])))[:, 0])
-    disparity = dense_disparity(views, search, params, camera_left, doffs, baseline_m, pad=True)
+        place = columns(*torch.broadcast_tensors(x, y[:, None]))
+        views, looks = (
+            list(interpolate(values, retina, place)[:, 0]),
+            retina.inside(place * (1 - 2 / min(height, width))),
+        )
+    disparity = dense_disparity(views, search, params, camera_left, doffs, baseline_m, True, looks)
     found = match_disparity(
         disparity.disparity,
         camera_left,
@@ -109,6 +114,7 @@ def match_rectified(
         farthest_range_m=farthest_range_m,
         edge_px=params.edge_px,
         pair=pair,
+        rival_px=disparity.rival_px,
     )
     return found._replace(disparity=disparity._replace(clues=found.disparity.clues))
 
@@ -127,6 +133,7 @@ def match_disparity(
     edge_px: float = 1.0,
     pair: Tensor | None = None,
     move: bool = True,
+    rival_px: Tensor | None = None,
 ) -> RectifiedMatch:
     """Correspondences from a disparity map of any origin: a file, a learned matcher, the truth.
 
@@ -144,6 +151,7 @@ def match_disparity(
         edge_px: neighbouring disparities further apart than this are different surfaces, never averaged.
         pair: (2, 1, H, W), both images in grey, to refine the readings of a retina on; None: read only.
         move: whether the images may move a reading, or only say how well they bear it out.
+        rival_px: (H, W), see `Disparity`.
 
     Returns:
         As `match_rectified`; the image of the returned disparity is black.
@@ -174,7 +182,7 @@ def match_disparity(
         left_px = retina.centers_px(values.device, values.dtype)
         budget = budget if budget.source_px is None else replace(budget, source_px=min(height, width))
     place = left_px * scale + left_px.new_tensor([u0, v0])
-    field = Disparity(torch.zeros_like(values), values, trusted, camera_left, doffs, baseline_m)
+    field = Disparity(torch.zeros_like(values), values, trusted, camera_left, doffs, baseline_m, rival_px)
 
     def read(px: Tensor) -> tuple[Tensor, Tensor]:
         shift, found = read_disparity(field, px * scale + px.new_tensor([u0, v0]), edge_px)

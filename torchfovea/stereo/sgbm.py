@@ -155,7 +155,7 @@ def disparity_sgbm(
         blockSize=params.block_px,
         P1=small,
         P2=large,
-        disp12MaxDiff=params.left_right_px,
+        disp12MaxDiff=params.left_right_px if params.left_right_px >= 0 else 2**15,  # it takes negative ones for 1
         preFilterCap=params.prefilter_cap,
         uniquenessRatio=params.uniqueness_percent,
         speckleWindowSize=params.speckle_px,

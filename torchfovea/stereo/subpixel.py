@@ -46,11 +46,13 @@ class Offset(NamedTuple):
         value: δ in units.
         variance: of it, units².
         correlation: of the neighbourhoods there, up to 1; what cannot be trusted correlates with nothing.
+        misfit: mean square difference of the images over the 3 × 3 cells about each, whatever their exposures.
     """
 
     value: Tensor
     variance: Tensor
     correlation: Tensor
+    misfit: Tensor
 
 
 def subpixel(
@@ -105,7 +107,9 @@ def subpixel(
     precision = near_weight + 1 / doubt
     value = (near * near_weight + expected / doubt) / precision
     rest = error - value * pull + value.square() * energy / 4
-    return Offset(value, 1 / precision, weight[:, 0] * (1 - (rest / (2 * ll)).clamp(min=0)))
+    correlation = weight[:, 0] * (1 - (rest / (2 * ll)).clamp(min=0))
+    differs = left - mean[:, 0] - gain * (right - mean[:, 1])
+    return Offset(value, 1 / precision, correlation, average(differs.detach().square(), 1, closed))
 
 
 @torch.no_grad()

@@ -35,8 +35,8 @@ class Sweep:
         noise: standard deviation of the images' noise, of a range of 1.
         uniqueness: by how much the second-best surface's cost must exceed the best's, as a share of it.
         correlation: least correlation of a match.
-        left_right_widths: RFs that claim one place of the right eye must agree to within so many RF widths with the
-            best of them; infinite: unchecked.
+        left_right: whether RFs that claim one place of the right eye from different depths are settled
+            (`torchfovea.stereo.visibility`).
         winner_widths: standard deviation of a surface's refinements about their surroundings', in RF widths; what is
             known of a match without texture is what is known of its surroundings.
         temperature: scales the variance that the images give.
@@ -53,7 +53,7 @@ class Sweep:
     noise: float = 0.004
     uniqueness: float = 0.05
     correlation: float = 0.5
-    left_right_widths: float = 1.0
+    left_right: bool = True
     winner_widths: float = 0.2
     temperature: float = 1.0
     volume_sigmas: float = 3.0
@@ -72,7 +72,7 @@ class Sweep:
         require(large, "matcher.smooth_large", self.smooth_large, f"at least smooth_small = {self.smooth_small}")
         require(-1 <= self.correlation < 1, "matcher.correlation", self.correlation, "-1 to less than 1")
         require(0 <= self.uniqueness < math.inf, "matcher.uniqueness", self.uniqueness, "0 or more")
-        for name in ("contrast", "noise", "left_right_widths", "winner_widths", "temperature", "volume_sigmas"):
+        for name in ("contrast", "noise", "winner_widths", "temperature", "volume_sigmas"):
             require(getattr(self, name) > 0, f"matcher.{name}", getattr(self, name), "more than 0")
 
 
@@ -98,6 +98,7 @@ class Estimate(NamedTuple):
         variance: of it.
         correlation: of the neighbourhoods.
         unit: inverse depth that moves the match by the wider RF's width.
+        misfit: mean square difference of the images there.
         sharp: whether the refinement stays with its winner.
     """
 
@@ -105,6 +106,7 @@ class Estimate(NamedTuple):
     variance: Tensor
     correlation: Tensor
     unit: Tensor
+    misfit: Tensor
     sharp: Tensor
 
 
@@ -119,13 +121,13 @@ def match_sheet(eye: Eye, sheet: Sheet, params: Sweep, low: Tensor, high: Tensor
         high: (B, N), greatest.
 
     Returns:
-        The RFs (n,); their inverse depth, its variance, correlation and unit, (B, 4, n); and bool (B, n), whether
-        these can be believed. Differentiable in the images.
+        The RFs (n,); their inverse depth, its variance, correlation, unit and misfit, (B, 5, n); and bool (B, n),
+        whether these can be believed. Differentiable in the images.
     """
     winner = win(eye, sheet, params, low, high)
     estimate = refine(eye, sheet, winner, params)
     good = winner.clear & estimate.sharp & (estimate.correlation.detach() >= params.correlation)
-    values = torch.stack([estimate.rho, estimate.variance, estimate.correlation, estimate.unit], 1)
+    values = torch.stack(estimate[:5], 1)
     return (sheet.rf, *read_sheet(sheet, values, winner.rho, good, 1.5 * winner.step))
 
 
@@ -175,4 +177,5 @@ def refine(eye: Eye, sheet: Sheet, winner: Winner, params: Sweep) -> Estimate:
     offset = subpixel(eye, sheet, surface, unit, trusted, params.refine_window, params.noise, params.winner_widths)
     sharp = offset.value.detach().abs() < 1
     variance = params.temperature * offset.variance
-    return Estimate(surface + offset.value.clamp(-1, 1) * unit, variance * unit * unit, offset.correlation, unit, sharp)
+    rho = surface + offset.value.clamp(-1, 1) * unit
+    return Estimate(rho, variance * unit * unit, offset.correlation, unit, offset.misfit, sharp)

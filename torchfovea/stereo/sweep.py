@@ -134,7 +134,7 @@ def match_sweep(
         match_sheet(eye, sheet, params, low, high) for sheet in sheets(retina, 1 / eye.scale, pair.device, pair.dtype)
     ]
     order = torch.cat([rf for rf, _, _ in parts]).argsort()
-    rho, variance, correlation, unit = torch.cat([values for _, values, _ in parts], -1)[..., order].unbind(1)
+    rho, variance, correlation, unit, misfit = torch.cat([values for _, values, _ in parts], -1)[..., order].unbind(1)
     valid = torch.cat([found for _, _, found in parts], -1)[..., order]
 
     sigma = torch.where(valid, variance, torch.ones_like(variance)).sqrt()
@@ -144,16 +144,21 @@ def match_sweep(
     valid = valid & seen[:, 1] & ((place >= -0.5) & (place <= place.new_tensor([width - 0.5, height - 0.5]))).all(-1)
     slack = unit.detach()  # noise may carry a match past the last hypothesis
     valid = valid & (rho.detach() >= low - slack) & (rho.detach() <= high + slack)
-    if params.left_right_widths < math.inf:
-        valid = unrivalled(eye, rho.detach(), slack * params.left_right_widths, correlation.detach(), right_px, valid)
+    square = ((u[:, 2] - u[:, 0]).square() + (v[:, 2] - v[:, 0]).square()) / 4
+    motion = square.detach().sqrt()
+    hidden_px = None
+    if params.left_right:
+        apart = rho.detach() * motion / sigma.detach()
+        valid, hidden_px = unrivalled(retina, eye.scale, right_px.detach(), apart, misfit, valid)
     right_px = torch.where(valid[..., None], right_px, left_px)
     zero = torch.zeros_like(rho)
-    square = (u[:, 2] - u[:, 0]).square() + (v[:, 2] - v[:, 0]).square()
-    match_px = torch.where(valid, square, zero) / 4
-    noise_px = match_px.detach().sqrt() * eye.scale
+    match_px = torch.where(valid, square, zero)
+    noise_px = torch.where(valid, motion, zero) * eye.scale
     slope = torch.where(valid, noise_px / sigma.detach(), zero)
     clues = field_clues(torch.where(valid, rho.detach(), zero), valid, slope, retina, 1 / eye.scale)
-    clues = clues._replace(noise_px=noise_px, mismatch=torch.where(valid, 1 - correlation.detach(), zero))
+    clues = clues._replace(
+        noise_px=noise_px, mismatch=torch.where(valid, 1 - correlation.detach(), zero), hidden_px=hidden_px
+    )
     matches = Correspondences(
         left_px.expand(batch, -1, -1),
         right_px,
@@ -238,7 +243,7 @@ def match_sweep_rectified(
     seen = matches.valid[rf] & retina.inside(place)
     disparity = torch.where(seen, shift[rf], torch.zeros_like(place[..., 0]))
     doffs = camera_right.cx_px - camera_left.cx_px
-    field = Disparity(grey, disparity, seen, camera_left, doffs, baseline_m, found.clues)
+    field = Disparity(grey, disparity, seen, camera_left, doffs, baseline_m, clues=found.clues)
     return RectifiedMatch(matches, mine, theirs, field)
 
 

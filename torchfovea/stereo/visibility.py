@@ -1,38 +1,123 @@
-"""Whether both eyes can see what a match says, by the other matches of the same look. Not differentiable."""
+"""Which matches can be true together: a place of the right eye shows one surface, and is the like of one place.
+
+Beside a near thing lies what the right eye cannot see. Matchers extend the thing over it, by about half a window, or
+let it pass into the background; either way its likes on the right belong to somebody else. Of those that claim a place,
+or one within the half window, from different depths, the one whose neighbourhood differs least is believed: the
+left-right check of semi-global matching, with the small neighbourhoods of a pixel's own difference in place of the
+costs that the extension comes from. Not differentiable.
+"""
 
 from __future__ import annotations
-
-import math
 
 import torch
 from torch import Tensor
 
-from torchfovea.stereo.costs import Eye
+from torchfovea.sensing.retina import Retina
+from torchfovea.stereo.sheets import average
 
-__all__ = ["unrivalled"]
+__all__ = ["outdone", "undisputed", "unrivalled"]
+
+NEAR = 3  # half a window, in cells: as far as near things are extended
+APART = 0.5  # rivals' disparities differ by more, and by more than their places do, in cells
+CLEAR = 1.5  # a winner's misfit is less by this factor; else both may stay
 
 
 @torch.no_grad()
-def unrivalled(eye: Eye, rho: Tensor, limit: Tensor, correlation: Tensor, right_px: Tensor, valid: Tensor) -> Tensor:
-    """Which RFs agree, to a limit, with the best correlated of those that claim their place of the right eye; (B, N).
+def outdone(
+    cell: Tensor, shape: tuple[int, int], disparity: Tensor, misfit: Tensor, valid: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Which claims on places of the right eye are outdone by others.
 
-    This is the left-right check as semi-global matchers do it, from one sweep. Places are cells of a lattice for every
-    octave of RF widths; an RF asks that of its own octave, in which all RFs as narrow or narrower have their say.
+    Args:
+        cell: (B, N, 2) int64, the column and row that each claims.
+        shape: rows and columns.
+        disparity: (B, N), in cells.
+        misfit: (B, N), how much the neighbourhoods differ.
+        valid: bool (B, N), whether the claim counts.
+
+    Returns:
+        bool (B, N); and by how much the farthest rival's disparity differs, outdone or not, (B, N) in cells, 0: none.
     """
-    retina, scale = eye.retina, eye.scale
-    width = torch.maximum(retina.width_px(right_px), retina.width_px(retina.centers_px(rho.device, rho.dtype)))
+    rows, columns = shape
+    column, row = cell.unbind(-1)
+    valid = valid & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+    width = columns + 2 * NEAR
+    none = rows * width
+    index = torch.where(valid, row * width + column + NEAR, none)
+    empty = misfit.new_full((len(misfit), none + 1), torch.inf)
+    least = empty.scatter_reduce(1, index, torch.where(valid, misfit, torch.inf), "amin")
+    best = valid & (misfit == least.gather(1, index))
+    told = torch.zeros_like(empty).scatter(1, torch.where(best, index, none), disparity)
+    out, dispute = torch.zeros_like(valid), torch.zeros_like(disparity)
+    for k in range(-NEAR, NEAR + 1):
+        there = (index + k).clamp(0, none)
+        other = least.gather(1, there)
+        differs = (told.gather(1, there) - disparity).abs()
+        rival = (differs > APART + abs(k)) & other.isfinite()
+        out |= rival & (CLEAR * other < misfit)
+        dispute = torch.maximum(dispute, torch.where(rival, differs, torch.zeros_like(differs)))
+    return out & valid, torch.where(valid, dispute, torch.zeros_like(dispute))
+
+
+@torch.no_grad()
+def undisputed(left: Tensor, right: Tensor, disparity: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    """Where the disparities of a rectified pair are not outdone by others, bool (H, W); and disputes (H, W) [px].
+
+    Args:
+        left: (H, W), grey.
+        right: (H, W).
+        disparity: (H, W) [px].
+        valid: bool (H, W).
+    """
+    height, width = left.shape
+    x = torch.arange(width, device=left.device, dtype=left.dtype)
+    there = (x - disparity).clamp(0, width - 1)
+    first = there.floor().clamp(max=width - 2)
+    part, first = there - first, first.long()
+    like = torch.lerp(right.gather(1, first), right.gather(1, first + 1), part)
+    mine, theirs = left[valid], like[valid]
+    if mine.numel() < 2:
+        return valid, torch.zeros_like(disparity)
+    # exposures differ: one gain and offset
+    gain = mine.std() / theirs.std().clamp(min=1e-6)
+    square = ((left - mine.mean()) - gain * (like - theirs.mean())).square()
+    weight = valid.to(left)
+    misfit = average(torch.stack([square * weight, weight]), 1, False)
+    misfit = misfit[0] / misfit[1].clamp(min=1e-6)
+    row = torch.arange(height, device=left.device)[:, None].expand(height, width)
+    cell = torch.stack([(x - disparity).round().long(), row], -1)
+    flat = (a.reshape(1, -1) for a in (disparity, misfit, valid))
+    lost, dispute = (a.reshape(height, width) for a in outdone(cell.reshape(1, -1, 2), (height, width), *flat))
+    return valid & ~lost, dispute
+
+
+@torch.no_grad()
+def unrivalled(
+    retina: Retina, scale: float, right_px: Tensor, disparity_px: Tensor, misfit: Tensor, valid: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Which of the RFs' matches are not outdone by others, bool (B, N); and disputes (B, N) [image px].
+
+    Places are cells of a lattice for every octave of RF widths; an RF asks that of its own octave, in which all RFs as
+    narrow or narrower have their say.
+
+    Args:
+        retina: of both eyes.
+        scale: image pixels per retinal pixel.
+        right_px: (B, N, 2), where the right eye sees each [retinal px].
+        disparity_px: (B, N), along the rectified frame [retinal px].
+        misfit: (B, N), how much the neighbourhoods differ.
+        valid: bool (B, N).
+    """
+    own = retina.width_px(retina.centers_px(right_px.device, right_px.dtype))
+    width = torch.maximum(retina.width_px(right_px), own)
     octave = torch.where(valid, torch.log2(width * scale).clamp(min=0).ceil(), torch.zeros_like(width)).long()
-    out = valid
+    out, dispute = valid, torch.zeros_like(disparity_px)
     for k in range(int(octave.max()) + 1):
         pitch = 2.0**k / scale
-        reach = math.ceil(retina.radius_px / pitch)
-        side = 2 * reach + 1
-        column, row = ((right_px / pitch).round().clamp(-reach, reach).long() + reach).unbind(-1)
+        reach = int(retina.radius_px / pitch) + 1
+        cell = (right_px / pitch).round().long() + reach
         voter = valid & (octave <= k)
-        cell = torch.where(voter, row * side + column, side * side)
-        lowest = rho.new_full((len(rho), side * side + 1), -math.inf)
-        best = lowest.scatter_reduce(1, cell, correlation, "amax").gather(1, cell)
-        told = torch.where(voter & (correlation == best), rho, torch.full_like(rho, -math.inf))
-        theirs = lowest.scatter_reduce(1, cell, told, "amax").gather(1, cell)
-        out = out & ~(voter & (octave == k) & ((theirs - rho).abs() > limit))
-    return out
+        lost, differs = outdone(cell, (2 * reach + 1, 2 * reach + 1), disparity_px / pitch, misfit, voter)
+        mine = octave == k
+        out, dispute = out & ~(lost & mine), torch.where(mine, differs * 2.0**k, dispute)
+    return out, dispute

@@ -7,7 +7,7 @@ from the left eye: z = (ρ̂ − ρ)/σ_ρ. To first order (nearly exact in inve
 
 with the budget's variances σ_l², σ_r² of the places l, r in both retinas, so that the budget's few numbers can be
 fitted by gradient (`torchfovea.studies.fitting`). An error is taken for N(0, σ²) with the budget's inlier probability
-p, and for anything that was searched with 1 − p, evenly in inverse range. Every figure comes by field and by area: a
+p; with 1 − p the right place is anywhere on its line across the right retina. Figures come by field and by area: a
 log-polar retina has most of its fields in a disc of a few pixels.
 """
 
@@ -46,6 +46,7 @@ class Judged(NamedTuple):
         error: estimated less true inverse range from the left eye [1/m].
         left_gain: |∂ρ/∂l| of the left place [1/m per retinal px].
         right_gain: |∂ρ/∂r| of the right place.
+        line: inverse ranges that a line across the right retina spans there, where an outlier may fall [1/m].
         left_width_px: width of the receptive field there [retinal px]; its square is the area it stands for.
         right_width_px: width where the right eye sees the point.
         pixel_px: size of a source pixel on the retina [retinal px].
@@ -65,6 +66,7 @@ class Judged(NamedTuple):
     error: Tensor
     left_gain: Tensor
     right_gain: Tensor
+    line: Tensor
     left_width_px: Tensor
     right_width_px: Tensor
     pixel_px: Tensor
@@ -138,15 +140,22 @@ def judged(
     axis = camera.rays(torch.zeros_like(matches.left_px[:1])).expand_as(ray)
     # rounding leaves crumbs of the difference of squares
     claim = torch.where(own > 1e-4 * matches.right_sigma_px.square(), own, none).sqrt() / max(budget.claim, 1e-6)
-    told = (none if clues is None or clue is None else clue.to(width) for clue in clues or Clues._fields)
+    told = [none if clue is None else clue.to(width) for clue in clues or Clues(none, none)]
+    right_gain = torch.linalg.vector_norm(slopes[1], dim=-1)
     everything = Judged(
         rho.detach() - truth,
         torch.linalg.vector_norm(slopes[0], dim=-1),
-        torch.linalg.vector_norm(slopes[1], dim=-1),
+        right_gain,
+        2 * retina.radius_px * right_gain,
         width,
         retina.width_px(matches.right_px),
         torch.full_like(width, source),
-        *told,
+        told[0],
+        told[1],
+        told[2],
+        told[3],
+        told[4],
+        told[5],
         claim,
         1 / torch.where(known, truth, torch.ones_like(truth)),
         torch.atan2(torch.linalg.vector_norm(torch.linalg.cross(ray, axis), dim=-1), (ray * axis).sum(-1)),
@@ -186,33 +195,30 @@ def inlier_of(data: Judged, budget: Budget) -> Tensor:
     return inlier_share(budget, data.clues())
 
 
-def mixture_nll(error: Tensor, variance: Tensor, inlier: Tensor, nearest_m: float) -> Tensor:
-    """Negative log-likelihood of p N(0, σ²) + (1 − p) U over the inverse ranges searched [nats], elementwise.
+def mixture_nll(error: Tensor, variance: Tensor, inlier: Tensor, line: Tensor) -> Tensor:
+    """Negative log-likelihood of p N(0, σ²) + (1 − p)/line [nats], elementwise.
 
     Args:
         error: of inverse range [1/m].
         variance: σ², positive.
         inlier: p in (0, 1].
-        nearest_m: nearest range searched: an outlier falls evenly on [0, 1/nearest_m].
+        line: the inverse ranges that outliers fall on, see `Judged`.
 
     Returns:
         Like `error`. Differentiable.
     """
     sure = inlier >= 1
-    outlier = torch.log1p(-torch.where(sure, 0.5, inlier)).masked_fill(sure, -math.inf) + math.log(nearest_m)
+    outlier = torch.log1p(-torch.where(sure, 0.5, inlier)).masked_fill(sure, -math.inf) - torch.log(line)
     return -torch.logaddexp(torch.log(inlier) - gaussian_nll(error, variance), outlier)
 
 
-def judge(
-    data: Judged, sigma: Tensor, inlier: Tensor | None = None, nearest_m: float = 0.3, weight: Tensor | None = None
-) -> dict[str, float]:
+def judge(data: Judged, sigma: Tensor, inlier: Tensor | None = None, weight: Tensor | None = None) -> dict[str, float]:
     """How honest standard deviations and inlier probabilities are, in inverse range, and how sharp.
 
     Args:
         data: observations with truth.
         sigma: claimed, (N,) [1/m].
         inlier: claimed, (N,); None: certain.
-        nearest_m: nearest range searched.
         weight: of each, (N,), such as `Judged.area`; None: all alike.
 
     Returns:
@@ -249,7 +255,7 @@ def judge(
         "inlier_coverage_50": _mean(inside[0.5].double(), likely),
         "inlier_coverage_95": _mean(inside[0.95].double(), likely),
         "inlier_mean": _mean(p, w),
-        "mixture_nll": _mean(mixture_nll(error, sigma.square(), p, nearest_m), w),
+        "mixture_nll": _mean(mixture_nll(error, sigma.square(), p, data.line.double()), w),
     }
 
 

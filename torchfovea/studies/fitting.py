@@ -1,6 +1,6 @@
 """Fitting the error budget to observations with truth: one likelihood for σ and the inlier probability.
 
-An error of inverse range is N(0, σ²) with probability p, and lies anywhere in what was searched with 1 − p. σ² is the
+An error of inverse range is N(0, σ²) with probability p; with 1 − p the match is anywhere on its line. σ² is the
 budget's sum of variances and the odds (1 − p)/p its product of clues (`torchfovea.sensing.correspondence.Budget`); both
 are fitted together by maximum likelihood, every observation weighted by the area that it stands for and every scene
 alike. A truth that comes in steps cannot show an error below its step: the matcher's own is not fitted below it.
@@ -44,18 +44,15 @@ class Likelihood:
 
     Attributes:
         outlier_share: share of outliers where no clue speaks: where the fit starts.
-        nearest_m: nearest range searched; an outlier's inverse range lies evenly on [0, 1/nearest_m].
         fit_outliers: fit the shares too; otherwise every outlier is left to σ but the share it starts with.
     """
 
     outlier_share: float = 0.02
-    nearest_m: float = 0.3
     fit_outliers: bool = True
 
     def __post_init__(self) -> None:
         """Raise SettingError for impossible numbers."""
         require(0 < self.outlier_share < 0.5, "fit.outlier_share", self.outlier_share, "between 0 and 0.5")
-        require(0 < self.nearest_m < math.inf, "matcher.nearest_range_m", self.nearest_m, "a positive distance")
 
 
 class BudgetFit(NamedTuple):
@@ -124,7 +121,7 @@ def fit_budget(
         terms = [
             mixture_nll(
                 data.error, _variance(data, numbers, least_match), torch.sigmoid(-_odds(data, numbers, base)),
-                likelihood.nearest_m,
+                data.line,
             ).mean()
             for data in sets
         ]  # fmt: skip

@@ -1,0 +1,36 @@
+"""Two eyes that are exposed or processed differently, brought together: what block matching compares are grey levels.
+
+A gain, an offset or a gamma between the eyes keeps the order of grey levels; the eyes see nearly the same things, so
+that the levels of equal rank are the same level. Not differentiable.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+__all__ = ["alike"]
+
+RANKS = 33
+
+
+@torch.no_grad()
+def alike(pair: Tensor) -> Tensor:
+    """Give the right image the left one's exposure.
+
+    Args:
+        pair: (2, 1, H, W), the left image first, 0 to 1.
+
+    Returns:
+        The same, the right image through a curve that takes its quantiles to the left one's.
+    """
+    flat = pair.flatten(1)
+    stride = max(1, flat.shape[1] // 20_000)
+    rank = torch.linspace(0, 1, RANKS, device=pair.device, dtype=pair.dtype)
+    left, right = torch.quantile(flat[:, ::stride], rank, dim=1).unbind(1)
+    right = right + torch.arange(RANKS, device=pair.device, dtype=pair.dtype) * 1e-6  # ascending where levels repeat
+    level = pair[1].contiguous()
+    k = torch.searchsorted(right, level).clamp(1, RANKS - 1)
+    part = (level - right[k - 1]) / (right[k] - right[k - 1])
+    mapped = torch.lerp(left[k - 1], left[k], part.clamp(0, 1))
+    return torch.stack([pair[0], mapped])
