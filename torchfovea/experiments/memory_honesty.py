@@ -123,8 +123,9 @@ def _look(seeing: dict[str, Sensor], gaze: Gaze, generator: torch.Generator) -> 
         else:
             if pictures is None:
                 pictures = [frame.image for frame in arena.world.images(gaze)]
-            rig = verged(gaze.vergence, observer.head.baseline_m)
-            matches, _ = match_eyes(arena.matcher, *pictures, rig, observer.camera, observer.retina, observer.budget)
+            left, right = pictures
+            rig, budget = verged(gaze.vergence, observer.head.baseline_m), observer.budget
+            matches, _ = match_eyes(arena.matcher, left, right, rig, observer.camera, observer.retina, budget)
         pose = eyes(observer.head, gaze)
         for n, mind in minds.items():
             seeing[name].minds[n] = perceive(observer, mind, matches, pose)
