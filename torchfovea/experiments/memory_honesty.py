@@ -88,14 +88,16 @@ def _plan(cfg: DictConfig) -> tuple[list[str], list[int], list[int]]:
     sensors = OmegaConf.select(cfg, "honesty.sensors")
     good = OmegaConf.is_list(sensors) and len(sensors) > 0 and all(s in SENSORS for s in sensors)
     require(good, "honesty.sensors", sensors, "a list of " + ", ".join(SENSORS))
-    numbers = []
-    for setting in ("honesty.cells", "honesty.looks"):
-        values = OmegaConf.select(cfg, setting)
-        good = OmegaConf.is_list(values) and len(values) > 0
-        good = good and all(isinstance(v, int) and not isinstance(v, bool) and v >= 1 for v in values)
-        require(good, setting, values, "a list of whole numbers, at least 1")
-        numbers.append(sorted(set(values)))
-    return list(sensors), *numbers
+    cells, looks = (_wholes(cfg, setting) for setting in ("honesty.cells", "honesty.looks"))
+    return [str(name) for name in sensors], cells, looks
+
+
+def _wholes(cfg: DictConfig, setting: str) -> list[int]:
+    values = OmegaConf.select(cfg, setting)
+    good = OmegaConf.is_list(values) and len(values) > 0
+    good = good and all(isinstance(v, int) and not isinstance(v, bool) and v >= 1 for v in values)
+    require(good, setting, values, "a list of whole numbers, at least 1")
+    return sorted(set(values))
 
 
 def _settings(cfg: DictConfig, sensor: str) -> DictConfig:
