@@ -11,15 +11,17 @@ from omegaconf import OmegaConf
 
 from torchfovea.config import conf_dir
 from torchfovea.deciding import acquisition, strategies
+from torchfovea.deciding.reward import nearest_to
 from torchfovea.deciding.strategies import View
 from torchfovea.experiments.build import build_observer
 from torchfovea.experiments.strategy import STRATEGIES, build_stop, build_strategy
+from torchfovea.gaussian import Information
 from torchfovea.memory.egosphere import Fusion, Prior
 from torchfovea.memory.sphere import fibonacci_directions
-from torchfovea.perception import Eligibility, Observer, decide, gaze_at, new_mind
+from torchfovea.perception import Eligibility, Observer, decide, gaze_at, new_mind, reward_of
 from torchfovea.sensing.camera import Pinhole
 from torchfovea.sensing.correspondence import Budget
-from torchfovea.sensing.head import Gaze, Head
+from torchfovea.sensing.head import Gaze, Head, gaze_point
 from torchfovea.sensing.layout import LogPolar
 from torchfovea.setting import SettingError
 from torchfovea.sim.cans import Cans
@@ -198,3 +200,61 @@ def test_the_configuration_has_the_defaults_of_the_dataclasses():
                 value = OmegaConf.to_container(OmegaConf.create({"v": node[field.name]}))["v"]
                 value = tuple(value) if isinstance(value, list) else value
                 assert value == getattr(kind(), field.name), f"{kind.__name__}.{field.name}"
+
+
+def known_mind(observer: Observer, cells: torch.Tensor, rho: torch.Tensor, votes: tuple[float, float]):
+    """A mind that has seen every other cell at inverse ranges (Nx,), with these votes for and against."""
+    mind = new_mind(observer, cells)
+    memory, seen = mind.memory, (torch.arange(len(cells)) % 2 == 0).to(cells)
+    if observer.fusion.chart == "cartesian":
+        points = cells / rho[:, None]
+        matrix = torch.tensor([1.0, 0, 0, 1, 0, 1]).to(cells) * 1e4
+        information = Information(seen[:, None] * 1e4 * points, seen[:, None] * matrix)
+    else:
+        vector = torch.stack([0 * rho, 0 * rho, 1e4 * rho], -1)
+        information = Information(
+            seen[:, None] * vector, seen[:, None] * torch.tensor([0.0, 0, 0, 0, 0, 1e4]).to(cells)
+        )
+    total = Information(*(a + b for a, b in zip(memory.information, information, strict=True)))
+    counted = seen[:, None] * torch.tensor(votes).to(cells)
+    return mind._replace(memory=memory._replace(information=total, looks=seen, votes=counted))
+
+
+@pytest.mark.parametrize("fusion", ["inverse_range", "aligned"])
+def test_a_function_of_points_is_a_reward_as_good_as_a_named_one(fusion):
+    cells = fibonacci_directions(60)
+    prior = Prior() if fusion == "inverse_range" else Prior(4.0, 4.0)
+    named = Observer(fusion=Fusion(fusion), prior=prior, reward="range")
+    own = dataclasses.replace(named, reward=lambda x: -x.norm(dim=-1))
+    mind = known_mind(
+        named, cells, 0.3 + torch.rand(60, generator=torch.Generator().manual_seed(0)).to(cells), (1.0, 0.0)
+    )
+    for a, b in zip(reward_of(named, mind)[1], reward_of(own, mind)[1], strict=True):
+        torch.testing.assert_close(a, b)
+    point = torch.tensor([0.5, 0.3, -0.2], dtype=cells.dtype)
+    near = dataclasses.replace(named, reward=nearest_to(point))
+    points, reward = reward_of(near, mind)
+    torch.testing.assert_close(reward.mean[::2], -(points.mean - point).norm(dim=-1)[::2])
+    assert int(decide(near, mind).cell) >= 0
+
+
+def test_a_surface_is_worth_as_much_as_it_is_believed():
+    cells, observer = fibonacci_directions(60), Observer()
+    rho = torch.full((60,), 1.5, dtype=cells.dtype)
+    sure, doubtful = (reward_of(observer, known_mind(observer, cells, rho, v))[1] for v in ((3.0, 0.0), (0.3, 2.7)))
+    prior = observer.prior
+    std = doubtful.std[0].item()
+    torch.testing.assert_close(sure.mean[::2], rho[::2], rtol=1e-3, atol=0)
+    torch.testing.assert_close(doubtful.mean[::2], 0.1 * sure.mean[::2] + 0.9 * prior.mean)
+    assert std == pytest.approx(0.1 * sure.std[0].item() + 0.9 * prior.std / math.sqrt(3.7))
+    for reward in (sure, doubtful):  # what no look reached is as it was
+        assert (reward.mean[1::2] == prior.mean).all() and (reward.std[1::2] == prior.std).all()
+
+
+def test_the_eyes_do_not_meet_at_a_surface_that_is_doubted():
+    cells = torch.tensor([[1.0, 0, 0]], dtype=torch.float64)
+    observer = Observer()
+    rho = torch.tensor([1.5], dtype=torch.float64)
+    for votes, range_m in (((2.0, 0.0), 1 / 1.5), ((0.2, 1.8), 1 / observer.prior.mean)):
+        step = decide(observer, known_mind(observer, cells, rho, votes))
+        assert gaze_point(observer.head, step.gaze).norm().item() == pytest.approx(range_m, rel=1e-3)

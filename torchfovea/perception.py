@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
@@ -11,9 +12,15 @@ import torch
 from torch import Tensor
 
 from torchfovea.deciding.acquisition import Generators, choose
-from torchfovea.deciding.reward import RewardBelief, inverse_range_from_range, range_from_inverse_range, range_reward
+from torchfovea.deciding.reward import (
+    RewardBelief,
+    inverse_range_from_range,
+    range_from_inverse_range,
+    range_reward,
+    user_reward,
+)
 from torchfovea.deciding.strategies import DEFAULT, Strategy, View, evaluate
-from torchfovea.gaussian import Gaussian
+from torchfovea.gaussian import Gaussian, columns
 from torchfovea.memory.egosphere import (
     EgoSphere,
     Fusion,
@@ -72,7 +79,8 @@ class Observer:
         rotated: see `torchfovea.sensing.unscented.sigma_root`.
         fusion: how observations enter the memory.
         prior: of a cell not yet seen.
-        reward: `inverse_range` or `range`: near is good, in either measure (Eq. 36).
+        reward: `inverse_range` or `range`: near is good, in either measure (Eq. 36); or any function of points
+            (..., 3) in E that returns a number for each (`torchfovea.deciding.reward.user_reward`).
         acquisition: scores the cells, see `torchfovea.deciding.strategies`.
         eligibility: which cells may be fixated.
     """
@@ -85,13 +93,14 @@ class Observer:
     rotated: bool = True
     fusion: Fusion = field(default_factory=Fusion)
     prior: Prior = field(default_factory=Prior)
-    reward: str = "inverse_range"
+    reward: str | Callable[[Tensor], Tensor] = "inverse_range"
     acquisition: Strategy = DEFAULT
     eligibility: Eligibility = field(default_factory=Eligibility)
 
     def __post_init__(self) -> None:
         """Raise SettingError for an unknown reward."""
-        require(self.reward in ("inverse_range", "range"), "reward", self.reward, "inverse_range or range")
+        known = self.reward in ("inverse_range", "range") or callable(self.reward)
+        require(known, "reward", self.reward, "inverse_range, range or a function of points (..., 3)")
 
 
 class Mind(NamedTuple):
@@ -187,6 +196,32 @@ def _in_view(observer: Observer, memory: EgoSphere, eyes: Eyes) -> Tensor:
     return inside
 
 
+def _rewards(observer: Observer, mind: Mind) -> tuple[Gaussian, RewardBelief, RewardBelief]:
+    """Points of the surfaces, their reward, and that of an unseen one: a number, or one for each cell."""
+    moments, prior, cartesian = belief(mind.memory), observer.prior, observer.fusion.chart == "cartesian"
+    points = moments if cartesian else cartesian_from_patches(moments, mind.memory)
+    if not isinstance(observer.reward, str):
+        # the prior's range is uncertain along the ray; in x, y, z it is so in every direction
+        sigma = prior.std if cartesian else prior.std / prior.mean**2
+        x, y, z = mind.memory.cells.unbind(-1)
+        zero, one = torch.zeros_like(x), torch.ones_like(x)
+        shape = (one, zero, zero, one, zero, one) if cartesian else (x * x, x * y, x * z, y * y, y * z, z * z)
+        unseen = Gaussian(_unseen_points(observer, mind), columns(*(sigma**2 * part for part in shape)))
+        return points, user_reward(observer.reward, points), user_reward(observer.reward, unseen)
+    like = points.mean.dtype
+    if cartesian:
+        reward = range_reward(points)
+        then = RewardBelief(*(torch.tensor(v, dtype=like) for v in (-prior.mean, prior.std)))
+        if observer.reward == "inverse_range":
+            reward, then = inverse_range_from_range(reward), inverse_range_from_range(then)
+    else:
+        reward = RewardBelief(moments.mean[..., 2], moments.cov[..., 5].sqrt())
+        then = RewardBelief(*(torch.tensor(v, dtype=like) for v in (prior.mean, prior.std)))
+        if observer.reward == "range":
+            reward, then = range_from_inverse_range(reward), range_from_inverse_range(then)
+    return points, reward, then
+
+
 def reward_of(observer: Observer, mind: Mind) -> tuple[Gaussian, RewardBelief]:
     """Each cell's 3-D belief and reward (Eq. 36-40).
 
@@ -195,20 +230,7 @@ def reward_of(observer: Observer, mind: Mind) -> tuple[Gaussian, RewardBelief]:
     comparison of thousands. Of the prior's standard deviation looks that should have shown something, and did not,
     leave less and less. Unseen cells that no look has reached share the prior's reward exactly: ties are ties.
     """
-    moments = belief(mind.memory)
-    prior = observer.prior
-    if observer.fusion.chart == "cartesian":
-        points = moments
-        reward = range_reward(points)
-        unseen = RewardBelief(*(torch.tensor(v, dtype=points.mean.dtype) for v in (-prior.mean, prior.std)))
-        if observer.reward == "inverse_range":
-            reward, unseen = inverse_range_from_range(reward), inverse_range_from_range(unseen)
-    else:
-        points = cartesian_from_patches(moments, mind.memory)
-        reward = RewardBelief(moments.mean[..., 2], moments.cov[..., 5].sqrt())
-        unseen = RewardBelief(*(torch.tensor(v, dtype=points.mean.dtype) for v in (prior.mean, prior.std)))
-        if observer.reward == "range":
-            reward, unseen = range_from_inverse_range(reward), range_from_inverse_range(unseen)
+    points, reward, unseen = _rewards(observer, mind)
     sure, fruitless = trust(mind.memory), mind.memory.votes[..., 1]
     mean, std = (then.to(reward.mean) for then in unseen)
     std = std * (1 + fruitless).rsqrt()
