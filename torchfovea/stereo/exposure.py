@@ -12,6 +12,7 @@ from torch import Tensor
 __all__ = ["alike"]
 
 RANKS = 33
+STEPS = 2048
 
 
 @torch.no_grad()
@@ -25,12 +26,16 @@ def alike(pair: Tensor) -> Tensor:
         The same, the right image through a curve that takes its quantiles to the left one's.
     """
     flat = pair.flatten(1)
-    stride = max(1, flat.shape[1] // 20_000)
+    stride = max(1, flat.shape[1] // 5_000)
     rank = torch.linspace(0, 1, RANKS, device=pair.device, dtype=pair.dtype)
     left, right = torch.quantile(flat[:, ::stride], rank, dim=1).unbind(1)
     right = right + torch.arange(RANKS, device=pair.device, dtype=pair.dtype) * 1e-6  # ascending where levels repeat
-    level = pair[1].contiguous()
+    level = torch.linspace(0, 1, STEPS + 1, device=pair.device, dtype=pair.dtype)
     k = torch.searchsorted(right, level).clamp(1, RANKS - 1)
     part = (level - right[k - 1]) / (right[k] - right[k - 1])
-    mapped = torch.lerp(left[k - 1], left[k], part.clamp(0, 1))
+    curve = torch.lerp(left[k - 1], left[k], part.clamp(0, 1))
+    # read from a table of even steps, which is faster than a search for every pixel
+    at = pair[1].clamp(0, 1) * STEPS
+    step = at.long().clamp(max=STEPS - 1)
+    mapped = torch.lerp(curve[step], curve[step + 1], at - step)
     return torch.stack([pair[0], mapped])

@@ -42,20 +42,21 @@ def outdone(
     column, row = cell.unbind(-1)
     valid = valid & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
     width = columns + 2 * NEAR
-    none = rows * width
+    none = rows * width + NEAR
     index = torch.where(valid, row * width + column + NEAR, none)
-    empty = misfit.new_full((len(misfit), none + 1), torch.inf)
-    least = empty.scatter_reduce(1, index, torch.where(valid, misfit, torch.inf), "amin")
+    least = misfit.new_full((len(misfit), none + NEAR + 1), torch.inf)
+    least = least.scatter_reduce(1, index, torch.where(valid, misfit, torch.inf), "amin")
     best = valid & (misfit == least.gather(1, index))
-    told = torch.zeros_like(empty).scatter(1, torch.where(best, index, none), disparity)
+    # nobody's disparity differs from nothing's
+    told = torch.full_like(least, torch.nan).scatter(1, torch.where(best, index, none), disparity)
+    told[:, none] = torch.nan
     out, dispute = torch.zeros_like(valid), torch.zeros_like(disparity)
     for k in range(-NEAR, NEAR + 1):
-        there = (index + k).clamp(0, none)
-        other = least.gather(1, there)
-        differs = (told.gather(1, there) - disparity).abs()
-        rival = (differs > APART + abs(k)) & other.isfinite()
-        out |= rival & (CLEAR * other < misfit)
-        dispute = torch.maximum(dispute, torch.where(rival, differs, torch.zeros_like(differs)))
+        there = index + k
+        differs = told.gather(1, there).sub_(disparity).abs_()
+        rival = differs > APART + abs(k)
+        out |= rival & (least.gather(1, there).mul_(CLEAR) < misfit)
+        dispute = torch.where(rival & (differs > dispute), differs, dispute)
     return out & valid, torch.where(valid, dispute, torch.zeros_like(dispute))
 
 
@@ -75,20 +76,23 @@ def undisputed(left: Tensor, right: Tensor, disparity: Tensor, valid: Tensor) ->
     first = there.floor().clamp(max=width - 2)
     part, first = there - first, first.long()
     like = torch.lerp(right.gather(1, first), right.gather(1, first + 1), part)
-    mine, theirs = left[valid], like[valid]
-    if mine.numel() < 2:
+    claims = valid.flatten().nonzero()[:, 0]
+    if claims.numel() < 2:
         return valid, torch.zeros_like(disparity)
+    mine, theirs = left.flatten()[claims], like.flatten()[claims]
     # exposures differ: one gain and offset
     gain = mine.std() / theirs.std().clamp(min=1e-6)
     square = ((left - mine.mean()) - gain * (like - theirs.mean())).square()
     weight = valid.to(left)
     misfit = average(torch.stack([square * weight, weight]), 1, False)
     misfit = misfit[0] / misfit[1].clamp(min=1e-6)
-    row = torch.arange(height, device=left.device)[:, None].expand(height, width)
-    cell = torch.stack([(x - disparity).round().long(), row], -1)
-    flat = (a.reshape(1, -1) for a in (disparity, misfit, valid))
-    lost, dispute = (a.reshape(height, width) for a in outdone(cell.reshape(1, -1, 2), (height, width), *flat))
-    return valid & ~lost, dispute
+    shift = disparity.flatten()[claims]
+    cell = torch.stack([(claims % width - shift).round().long(), claims // width], -1)
+    every = torch.ones_like(claims, dtype=torch.bool)
+    lost, dispute = outdone(cell[None], (height, width), shift[None], misfit.flatten()[claims][None], every[None])
+    kept, rivals = (torch.zeros_like(a).flatten() for a in (valid, disparity))
+    kept[claims], rivals[claims] = ~lost[0], dispute[0]
+    return kept.reshape(height, width), rivals.reshape(height, width)
 
 
 @torch.no_grad()
