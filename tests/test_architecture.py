@@ -20,7 +20,7 @@ ROOMS = {"sensing", "stereo", "memory", "deciding", "studies"}
 FLOORS = (
     ("setting", "files"),
     ("gaussian",),
-    ("camera", "layout", "retina", "sheets", "head", "unscented", "chart", "significance"),
+    ("camera", "layout", "sampling", "retina", "sheets", "head", "unscented", "chart", "significance"),
     ("topology", "sphere", "cell_index", "nearest"),
     (
         "correspondence",
