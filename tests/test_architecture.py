@@ -20,7 +20,20 @@ ROOMS = {"sensing", "stereo", "memory", "deciding", "studies"}
 FLOORS = (
     ("setting", "files"),
     ("gaussian",),
-    ("camera", "layout", "sampling", "retina", "sheets", "head", "unscented", "chart", "significance"),
+    (
+        "camera",
+        "lattice",
+        "layout",
+        "own_layout",
+        "sampling",
+        "triangles",
+        "retina",
+        "sheets",
+        "head",
+        "unscented",
+        "chart",
+        "significance",
+    ),
     ("topology", "sphere", "cell_index", "nearest"),
     (
         "correspondence",

@@ -163,6 +163,7 @@ def _builders(cfg: DictConfig, device: str, wanted: tuple[str, ...]) -> list[Cal
     """What makes the paths, each when its turn comes."""
     full = build_observer(cfg)
     require(isinstance(full.retina, LogPolar), "sensor.layout", cfg.sensor.layout, "log_polar, in bench")
+    assert isinstance(full.retina, LogPolar)
     require(cfg.sensor.camera == "pinhole", "sensor.camera", cfg.sensor.camera, "pinhole, in bench")
     require(full.fusion.chart == "inverse_range", "fusion", full.fusion.name, "inverse_range, in bench")
     require(full.points is None and full.rotated, "budget.sigma_points", "paper", "ours, in bench")

@@ -234,7 +234,7 @@ def _draw(
 ) -> None:
     from torchfovea.pictures.sensor import draw_fig5, draw_layouts
 
-    fields = sensor.retina.receptive_fields
+    fields = cfg.sensor.receptive_fields
     title = (
         f"Fig. 5: {fields} receptive fields, field of view {cfg.sensor.fov_deg:g}°, baseline {sensor.baseline_m:g} m"
     )

@@ -21,6 +21,7 @@ from torch import Tensor
 from torchfovea.gaussian import columns
 from torchfovea.sensing.layout import LogPolar, Retina, Uniform, cortical
 from torchfovea.sensing.sampling import place, read, sampling, wide
+from torchfovea.sensing.triangles import from_triangles
 from torchfovea.setting import require
 
 __all__ = ["LogPolar", "Retina", "Uniform", "cortical", "covered", "fovea", "interpolate", "reconstruct"]
@@ -93,7 +94,8 @@ def interpolate(values: Tensor, retina: Retina, px: Tensor) -> Tensor:
     """Values between the RFs, at any place of the retina.
 
     Bilinear in (log ρ, θ), with wrap-around in θ, on a log-polar retina, and on the lattice of a uniform one. From the
-    centre of ring 0 inward a log-polar retina without a uniform fovea goes over, linearly in ρ, to the ring's mean.
+    centre of ring 0 inward a log-polar retina without a uniform fovea goes over, linearly in ρ, to the ring's mean. On
+    any other layout linear over the triangles between neighbouring RFs (Delaunay's).
 
     Args:
         values: (B, C, N).
@@ -117,6 +119,8 @@ def interpolate(values: Tensor, retina: Retina, px: Tensor) -> Tensor:
     flat = px.detach().to(values).reshape(-1, 2)
     if isinstance(retina, Uniform):
         out = _from_lattice(values, retina, flat)
+    elif not isinstance(retina, LogPolar):
+        out = from_triangles(values, retina.centers_px("cpu", torch.float64), flat)
     else:
         out = _from_rings(values, retina, flat)
         if retina.fovea_count:
@@ -213,7 +217,7 @@ def _from_rings(values: Tensor, retina: LogPolar, px: Tensor) -> Tensor:
     return _bilinear(image, column, row)
 
 
-def _from_lattice(values: Tensor, retina: Retina, px: Tensor) -> Tensor:
+def _from_lattice(values: Tensor, retina: LogPolar | Uniform, px: Tensor) -> Tensor:
     """(B, C, N) of a uniform retina, or of a uniform fovea, at px (P, 2)."""
     index, axis, pitch = _dense(retina, values.device)
     return _bilinear(values[..., index], px[:, 0] / pitch + axis[0], px[:, 1] / pitch + axis[1])
@@ -226,7 +230,7 @@ def _bilinear(image: Tensor, column: Tensor, row: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=64)
-def _dense(retina: Retina, device: torch.device) -> tuple[Tensor, tuple[float, float], float]:
+def _dense(retina: LogPolar | Uniform, device: torch.device) -> tuple[Tensor, tuple[float, float], float]:
     """The square image that holds a disc's lattice: which RF each pixel shows, the axis' column and row, the pitch.
 
     Corners show the nearest RF of their row.
