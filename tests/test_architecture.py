@@ -18,7 +18,7 @@ ROOMS = {"sensing", "stereo", "memory", "deciding", "studies"}
 
 # From the ground up. A module imports from its own floor (never in a circle) or from those below it.
 FLOORS = (
-    ("setting", "files"),
+    ("setting", "files", "imported"),
     ("gaussian",),
     (
         "camera",
@@ -81,7 +81,7 @@ FLOORS = (
     ("perception", "arena"),
     ("tuning", "episode"),
     ("sim",),
-    ("pictures", "config", "mistakes"),
+    ("pictures", "config", "mistakes", "trust"),
     ("cli", "experiments", "doctor", "bench", "__main__"),
 )
 FLOOR = {module: floor for floor, modules in enumerate(FLOORS) for module in modules}
@@ -89,8 +89,8 @@ FLOOR = {module: floor for floor, modules in enumerate(FLOORS) for module in mod
 # Heavy packages, and the only modules that may import them.
 ONLY_IN = {
     "mujoco": {"sim"},
-    "hydra": {"cli", "config", "mistakes", "experiments"},
-    "omegaconf": {"cli", "config", "mistakes", "experiments", "doctor"},
+    "hydra": {"cli", "config", "mistakes", "trust", "experiments"},
+    "omegaconf": {"cli", "config", "mistakes", "trust", "experiments", "doctor"},
     "matplotlib": {"pictures"},
     "cv2": {"sgbm", "disparity_files", "bench", "experiments"},
     "rich": {"cli", "experiments", "doctor"},

@@ -164,6 +164,7 @@ def _run(command: str, overrides: list[str]) -> int:
 
     from torchfovea.config import SweepFolder, conf_dir
     from torchfovea.mistakes import describe
+    from torchfovea.trust import refuse_foreign
 
     full_error = os.environ.get("HYDRA_FULL_ERROR") == "1"
     SweepFolder.latest = None
@@ -171,6 +172,7 @@ def _run(command: str, overrides: list[str]) -> int:
     with _as_program(command, overrides):
         app = hydra.main(version_base="1.3", config_path=conf_dir(), config_name=command)
         try:
+            refuse_foreign(command, overrides)
             app(_job(command, overrides, full_error))()
         except JobFailed:
             status = 1

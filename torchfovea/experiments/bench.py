@@ -22,6 +22,7 @@ from torchfovea.bench.steps import batched_steps, paths_of_steps
 from torchfovea.bench.timing import Path, Peer, Timing, copy_bandwidth, interleaved, same, slope
 from torchfovea.config import run_folder
 from torchfovea.experiments.build import build_arena, build_cells, build_observer, build_scene_of, choice, number, whole
+from torchfovea.experiments.named import construct
 from torchfovea.experiments.rollout import roll_out
 from torchfovea.files import write_csv, write_result
 from torchfovea.perception import Observer, Step, decide, new_mind, perceive
@@ -163,7 +164,6 @@ def _builders(cfg: DictConfig, device: str, wanted: tuple[str, ...]) -> list[Cal
     """What makes the paths, each when its turn comes."""
     full = build_observer(cfg)
     require(isinstance(full.retina, LogPolar), "sensor.layout", cfg.sensor.layout, "log_polar, in bench")
-    assert isinstance(full.retina, LogPolar)
     require(cfg.sensor.camera == "pinhole", "sensor.camera", cfg.sensor.camera, "pinhole, in bench")
     require(full.fusion.chart == "inverse_range", "fusion", full.fusion.name, "inverse_range, in bench")
     require(full.points is None and full.rotated, "budget.sigma_points", "paper", "ours, in bench")
@@ -172,9 +172,8 @@ def _builders(cfg: DictConfig, device: str, wanted: tuple[str, ...]) -> list[Cal
     fusion = dataclasses.replace(full.fusion, fill=False, conflict=math.inf, half_life=math.inf)
     head = dataclasses.replace(full.head, encoder_deg=0.0)
     plain = dataclasses.replace(full, fusion=fusion, head=head, reward="inverse_range")
-    small = dataclasses.replace(
-        plain, retina=dataclasses.replace(full.retina, receptive_fields=whole(cfg, "small.receptive_fields"))
-    )
+    fewer = {**cfg.sensor, "receptive_fields": whole(cfg, "small.receptive_fields")}
+    small = dataclasses.replace(plain, retina=construct(LogPolar, fewer, "sensor"))
     few = OmegaConf.merge(cfg, {"memory": {"cells": whole(cfg, "small.cells")}})
     assert isinstance(few, DictConfig)
 

@@ -14,10 +14,11 @@ from rich.table import Table
 from torchfovea.arena import Look
 from torchfovea.config import run_folder
 from torchfovea.episode import Episode
-from torchfovea.experiments.build import build_matcher, build_observer, choice, number, whole
+from torchfovea.experiments.build import build_match, build_motor, build_observer
 from torchfovea.experiments.manifest import complete, finished
 from torchfovea.experiments.progress import progress_bar
 from torchfovea.experiments.rollout import batched, device_of, one_episode, roll_out, sample_of
+from torchfovea.experiments.settings import choice, number, whole
 from torchfovea.experiments.strategy import build_stop, build_strategy
 from torchfovea.experiments.workers import worker_pool
 from torchfovea.files import write_csv
@@ -42,11 +43,11 @@ def run(cfg: DictConfig) -> float:
     episodes, saccades, seed = whole(cfg, "episodes"), whole(cfg, "saccades"), whole(cfg, "seed", 0)
     observer, folder = build_observer(cfg), run_folder()
     choice(cfg, "fidelity", ("photometric", "geometric"))
-    choice(cfg, "motor", ("instant", "physics"))
     device_of(cfg), sample_of(cfg), whole(cfg, "batch"), whole(cfg, "workers"), number(cfg, "far_m")
     number(cfg, "near_target_m"), build_stop(cfg)
     require(isinstance(cfg.picture, bool), "picture", cfg.picture, "true or false")
-    build_strategy(cfg, observer), build_matcher(cfg)  # mistakes come first, also in what is not used
+    # mistakes come first, also in what is not used
+    build_strategy(cfg, observer), build_match(cfg), build_motor(cfg)
     done = finished(cfg, folder)
     if done is not None:
         return done
