@@ -94,6 +94,7 @@ ONLY_IN = {
     "matplotlib": {"pictures"},
     "cv2": {"sgbm", "disparity_files", "bench", "experiments"},
     "rich": {"cli", "experiments", "doctor"},
+    "joblib": {"experiments"},
     "skimage": {"experiments"},
 }
 
@@ -192,7 +193,7 @@ def test_the_plan_is_up_to_date():
 
 
 def test_importing_torchfovea_is_light():
-    heavy = ("mujoco", "hydra", "omegaconf", "matplotlib", "cv2", "skimage", "rich")
+    heavy = ("mujoco", "hydra", "omegaconf", "matplotlib", "cv2", "skimage", "rich", "joblib", "kornia")
     code = f"import sys, torchfovea; print([name for name in {heavy!r} if name in sys.modules])"
     done = subprocess.run(
         [sys.executable, "-c", code],

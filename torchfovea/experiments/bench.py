@@ -22,8 +22,8 @@ from torchfovea.bench.steps import batched_steps, paths_of_steps
 from torchfovea.bench.timing import Path, Peer, Timing, copy_bandwidth, interleaved, same, slope
 from torchfovea.config import run_folder
 from torchfovea.experiments.build import build_arena, build_cells, build_observer, build_scene_of, choice, number, whole
-from torchfovea.experiments.named import construct
 from torchfovea.experiments.rollout import roll_out
+from torchfovea.experiments.settings import construct
 from torchfovea.files import write_csv, write_result
 from torchfovea.perception import Observer, Step, decide, new_mind, perceive
 from torchfovea.sensing.camera import image_camera
