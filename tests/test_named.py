@@ -12,6 +12,7 @@ from torchfovea.imported import load_function, load_object
 from torchfovea.perception import Observer
 from torchfovea.sensing.head import Head
 from torchfovea.setting import SettingError
+from torchfovea.sim.scene import AttentionWorld, Room
 from torchfovea.trust import load_trusted
 
 OWN = """
@@ -107,6 +108,13 @@ def test_every_group_takes_a_users_own_and_checks_it(own, group):
         cfg = configured(f"{group}={choice}", f"+{group}._target_={target}")
         with pytest.raises(SettingError, match=message):
             BUILD[group](cfg)
+
+
+def test_a_scene_file_without_targets_is_still_ours():
+    """As `tune` wrote them before scenes named what they are."""
+    old = {"scene": {"name": "attention_world", "can_radius_m": 0.08, "room": {"front_m": 4.5}}}
+    scene = build_scene_of(OmegaConf.create(old), Head(), 0)
+    assert scene.params == AttentionWorld(can_radius_m=0.08, room=Room(front_m=4.5))
 
 
 @pytest.mark.parametrize("group", ["scene", "motor", "sensor"])

@@ -9,7 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from torchfovea.experiments.budgets import build_budget
-from torchfovea.experiments.named import build_named, name_of
+from torchfovea.experiments.named import build_named, name_of, targets_of
 from torchfovea.experiments.settings import choice, construct, number, typed, whole
 from torchfovea.memory import sphere
 from torchfovea.memory.egosphere import Fusion, Prior
@@ -23,7 +23,7 @@ from torchfovea.setting import SettingError, require
 from torchfovea.sim.arena import Arena
 from torchfovea.sim.motor import Motor
 from torchfovea.sim.rays import Renderer
-from torchfovea.sim.scene import Scene, build_scene
+from torchfovea.sim.scene import Room, Scene, build_scene
 from torchfovea.sim.world import World
 from torchfovea.stereo.external import External
 from torchfovea.stereo.matchers import Match, Matcher
@@ -60,9 +60,9 @@ REACH_RANGE_M = 1.0
 def build_sensor(cfg: DictConfig) -> tuple[Camera, Retina]:
     """The eyes' camera, in retinal pixels, and their retina."""
     name_of(cfg, "sensor", "layout")
-    made = build_named(cfg, "sensor", "a layout of receptive fields", SENSOR)
-    # a user's own may be the layout itself, or a function without arguments that makes it
-    retina = check_retina(made if isinstance(made, Retina) and not isinstance(made, type) else made(), "sensor")
+    made = build_named(cfg, "sensor", "a layout of receptive fields", SENSOR, "layout")
+    # what a source names is a function without arguments that makes the layout
+    retina = check_retina(made() if OmegaConf.select(cfg, "sensor.source") is not None else made, "sensor")
     return build_camera(cfg, retina.radius_px), retina
 
 
@@ -126,6 +126,10 @@ def build_cells(cfg: DictConfig, head: Head, generator: torch.Generator, dtype: 
 def build_scene_of(cfg: DictConfig, head: Head, seed: int) -> Scene:
     """The scene of a configuration's group `scene`."""
     name_of(cfg, "scene")
+    if "room" in cfg.scene and "_target_" not in cfg.scene.room:  # as scene files were before _target_
+        merged = OmegaConf.merge(cfg, {"scene": {"room": {"_target_": f"{Room.__module__}.{Room.__name__}"}}})
+        assert isinstance(merged, DictConfig)
+        cfg = merged
     return build_scene(build_named(cfg, "scene", "a function (seed, head) that returns a Scene"), seed, head)
 
 
@@ -175,7 +179,7 @@ def build_match(cfg: DictConfig) -> Match:
     """The stereo matcher of two verged eyes, built in or a user's own."""
     name_of(cfg, "matcher")
     form = "a function (left, right, rig, camera, retina, budget) that returns (Correspondences, found)"
-    target = OmegaConf.select(cfg, "matcher._target_")
+    target = OmegaConf.select(cfg, "matcher._target_") or targets_of("matcher", "name").get(cfg.matcher.name)
     ours = isinstance(target, str) and target.startswith("torchfovea.")
     made = build_named(cfg, "matcher", form, MATCHER if ours else ("name",))
     if isinstance(made, SGBM | Sweep | External):

@@ -42,7 +42,7 @@ def name_of(cfg: DictConfig, group: str, key: str = "name") -> str:
     ours = targets_of(group, key)
     if name not in ours and isinstance(target, str) and target in ours.values():
         raise SettingError(f"{group}.{key} = {name}: expected one of {', '.join(ours)}, by {group}={name}")
-    if ours.get(name) not in (None, target):
+    if target is not None and ours.get(name) not in (None, target):
         raise SettingError(f"{group}.{key} = {name}: expected the name of what {group} is; for another, {group}={name}")
     return str(name)
 
@@ -58,7 +58,7 @@ def targets_of(group: str, key: str) -> dict[str, str | None]:
     return found
 
 
-def build_named(cfg: DictConfig, group: str, form: str, without: Collection[str] = ("name",)) -> Any:
+def build_named(cfg: DictConfig, group: str, form: str, without: Collection[str] = ("name",), key: str = "name") -> Any:
     """What a group of the configuration stands for.
 
     Args:
@@ -66,6 +66,7 @@ def build_named(cfg: DictConfig, group: str, form: str, without: Collection[str]
         group: the node's name.
         form: what is expected of a user's own, for errors.
         without: settings of the node that are not the thing's own.
+        key: the setting that bears its name; a node with one of our names and no `_target_` is ours.
 
     Raises:
         SettingError: in one line under the setting's name, for a `_target_` or `source` that does not exist, cannot be
@@ -75,7 +76,8 @@ def build_named(cfg: DictConfig, group: str, form: str, without: Collection[str]
     require(isinstance(node, DictConfig), group, node, form)
     plain = OmegaConf.to_container(node, resolve=True)
     assert isinstance(plain, dict)
-    if plain.get("_target_") is None:
+    plain.setdefault("_target_", targets_of(group, key).get(str(plain.get(key))))
+    if plain["_target_"] is None:
         require(plain.get("source") is not None, f"{group}.source", None, f"package.module:function, {form}")
         return load_function(plain["source"], f"{group}.source")
     settings = {str(key): value for key, value in plain.items() if key not in without}
