@@ -22,7 +22,7 @@ from torchfovea.setting import require
 __all__ = ["Finding", "run"]
 
 # What the defaults need, and what each of the others is for.
-REQUIRED = ("torch", "kornia", "mujoco", "numpy", "scipy", "filterpy", "hydra-core")
+REQUIRED = ("torch", "kornia", "mujoco", "numpy", "scipy", "filterpy", "hydra-core", "joblib")
 OPTIONAL = {
     "opencv-python-headless": "the default matcher: pip install 'torchfovea[stereo]'",
     "matplotlib": "pictures: pip install 'torchfovea[viz]'",

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchfovea.experiments.budgets import build_budget
 from torchfovea.experiments.named import build_named, name_of, targets_of
+from torchfovea.experiments.rewards import build_reward
 from torchfovea.experiments.settings import choice, construct, number, typed, whole
 from torchfovea.memory import sphere
 from torchfovea.memory.egosphere import Fusion, Prior
@@ -88,7 +89,7 @@ def build_observer(cfg: DictConfig) -> Observer:
         rotated=not printed,
         fusion=construct(Fusion, cfg.fusion, "fusion"),
         prior=construct(Prior, cfg.prior, "prior"),
-        reward=choice(cfg, "reward.name", ("inverse_range", "range")),
+        reward=build_reward(cfg),
         eligibility=construct(Eligibility, cfg.eligibility, "eligibility"),
     )
 

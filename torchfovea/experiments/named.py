@@ -40,7 +40,8 @@ def name_of(cfg: DictConfig, group: str, key: str = "name") -> str:
     require(isinstance(name, str) and bool(name), f"{group}.{key}", name, "a name, for pictures and tables")
     target = OmegaConf.select(cfg, f"{group}._target_")
     ours = targets_of(group, key)
-    if name not in ours and isinstance(target, str) and target in ours.values():
+    unknown = target is None and OmegaConf.select(cfg, f"{group}.source") is None
+    if name not in ours and (unknown or target in ours.values()):
         raise SettingError(f"{group}.{key} = {name}: expected one of {', '.join(ours)}, by {group}={name}")
     if target is not None and ours.get(name) not in (None, target):
         raise SettingError(f"{group}.{key} = {name}: expected the name of what {group} is; for another, {group}={name}")

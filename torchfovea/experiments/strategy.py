@@ -148,6 +148,8 @@ def oracle(best: Tensor | None) -> Strategy:
 
 def infomax(observer: Observer, overhead: float | None = None, unit: str = "degrees") -> Strategy:
     """The expected information of a fixation by an observer's sensor model, or that for every cost of the saccade."""
+    known = isinstance(observer.reward, str)
+    require(known, "acquisition", "infomax", "reward=inverse_range or range, of which it knows what a look brings")
     edge = torch.tensor([observer.retina.radius_px, 0.0], dtype=torch.float64)
     x, _, z = observer.camera.rays(edge).unbind(-1)
     return partial(
