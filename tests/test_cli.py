@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from joblib.externals.loky import get_reusable_executor
 
 import torchfovea
 from torchfovea.cli import COMMANDS, Command, main
@@ -242,7 +243,8 @@ def test_one_failing_job_does_not_stop_the_others(launcher, job, capfd, tmp_path
     if launcher == "joblib":
         # Workers look the command up for themselves: give them the real one, whose checks fail for one job.
         COMMANDS["doctor"] = Command("torchfovea.doctor:run", "", "")
-        # They may be those of an earlier sweep, which keep its working folder: the path is absolute.
+        # Those of an earlier sweep would keep its working folder and write to where its output went.
+        get_reusable_executor().shutdown()
         sweep = ["probe_timeout_s=60,-1", "hydra.launcher.n_jobs=2", f"hydra.sweep.dir={tmp_path}/multirun/doctor/it"]
         failed = {"1": "probe_timeout_s = -1: expected a positive number"}
         count = 2

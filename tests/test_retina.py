@@ -213,6 +213,20 @@ def test_batches_equal_loops(retina):
     torch.testing.assert_close(together.double(), double, atol=1e-4, rtol=1e-4)
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+@pytest.mark.parametrize("retina", [LogPolar(4000), Uniform(4000)], ids=name)
+def test_half_precision_is_rounded_once(retina, dtype):
+    """Of an image of half precision, whose pixels add up to more than float16 holds, only the result is rounded."""
+    image = torch.rand(1, 1, 400, 400).to(dtype)
+    gaze = torch.tensor([[210.3, 180.7]])
+    for looked in (None, gaze):
+        seen = fovea(image, looked, retina)
+        assert seen.dtype == dtype
+        assert torch.equal(seen, fovea(image.float(), looked, retina).to(dtype))
+    with torch.autocast("cpu", torch.bfloat16):
+        torch.testing.assert_close(fovea(image, gaze, retina), fovea(image.float(), gaze, retina).to(dtype))
+
+
 @pytest.mark.parametrize("retina", [LogPolar(200), LogPolar(300, uniform_fovea=True), Uniform(64)], ids=name)
 def test_gradients(retina):
     torch.manual_seed(0)

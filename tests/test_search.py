@@ -93,7 +93,7 @@ def test_same_seed_same_run_and_explicit_settings_beat_the_profile(folder, capsy
         (["saccades=0"], "saccades = 0"),
         (["episodes=-2"], "episodes = -2"),
         (["fidelity=perfect"], "fidelity = perfect: expected one of photometric, geometric"),
-        (["motor=magic"], "motor = magic: expected one of instant, physics"),
+        (["motor=magic"], "motor = magic: expected one of external, instant, physics"),
         (["head.baseline_m=0"], "head.baseline_m = 0"),
         (["prior.std=0"], "prior.std = 0"),
         (["fusion.name=mean"], "fusion = mean"),

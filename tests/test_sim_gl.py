@@ -55,10 +55,9 @@ def test_a_world_renders_with_gl(scene):
 
 
 def test_without_gl_the_setting_is_named(scene, monkeypatch):
-    monkeypatch.setattr(world, "available_gl", lambda: None)
+    monkeypatch.setattr(gl, "available_gl", lambda: None)
     with pytest.raises(SettingError, match="renderer = gl: expected a machine with EGL or OSMesa"):
         world.World(scene, renderer="gl")
-    monkeypatch.setattr(gl, "available_gl", lambda: None)
     other = build_scene(Cans(cans=2, room=Room(furniture=False)), 0)
     with pytest.raises(SettingError, match="renderer = gl: expected a machine with EGL or OSMesa"):
         gl.render(other, torch.eye(3), torch.zeros(3), image_camera(Pinhole(50.0), 100, 8), 8)

@@ -70,11 +70,13 @@ def test_no_worker_outlives_a_killed_command():
     # two that would work for minutes
     script = (
         "import os, time\n"
-        "from torchfovea.experiments.workers import worker_pool\n"
-        "if __name__ == '__main__':\n"
-        "    pool = worker_pool(2)\n"
-        "    print(*[pool.submit(os.getpid).result() for _ in range(4)], flush=True)\n"
-        "    [pool.submit(time.sleep, 600) for _ in range(4)]\n"
+        "from torchfovea.experiments.parallel import spread\n"
+        "def work(k):\n"
+        "    time.sleep(600 if k > 1 else 0.5)\n"
+        "    return os.getpid()\n"
+        "done = spread(work, range(6), 2)\n"
+        "print(next(done)[1], next(done)[1], flush=True)\n"
+        "list(done)\n"
     )
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as command:
         assert command.stdout is not None

@@ -34,6 +34,7 @@ def test_the_wheel_holds_the_package_and_all_of_conf(wheel):
         assert f"torchfovea/{source.relative_to(ROOT)}" in names
     for source in (ROOT / "torchfovea").rglob("*.py"):
         assert str(source.relative_to(ROOT)) in names
+    assert "torchfovea/py.typed" in names  # whoever builds on it is type-checked against it
     tops = {name.partition("/")[0] for name in names}
     assert {top for top in tops if not top.endswith(".dist-info")} == {"torchfovea"}
 

@@ -179,6 +179,7 @@ def _run(command: str, overrides: list[str]) -> int:
     from torchfovea.config import SweepFolder, conf_dir, help_text
     from torchfovea.mistakes import arranged, describe
     from torchfovea.setting import SettingError
+    from torchfovea.trust import refuse_foreign
 
     try:
         overrides = arranged(overrides)
@@ -195,6 +196,7 @@ def _run(command: str, overrides: list[str]) -> int:
     with _as_program(command, overrides):
         app = hydra.main(version_base="1.3", config_path=conf_dir(), config_name=command)
         try:
+            refuse_foreign(command, overrides)
             app(_job(command, overrides, full_error))()
         except JobFailed:
             status = 1

@@ -22,7 +22,7 @@ from torchfovea.setting import require
 __all__ = ["Finding", "run"]
 
 # What the defaults need, and what each of the others is for.
-REQUIRED = ("torch", "kornia", "numpy", "scipy", "filterpy", "hydra-core", "rich")
+REQUIRED = ("torch", "kornia", "numpy", "scipy", "filterpy", "hydra-core", "joblib", "rich")
 DEFAULTS = ("mujoco", "matplotlib")
 OPTIONAL = {
     "mujoco": "simulated worlds: pip install 'torchfovea[sim]'",

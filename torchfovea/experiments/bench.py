@@ -23,6 +23,7 @@ from torchfovea.bench.timing import Path, Peer, Timing, copy_bandwidth, interlea
 from torchfovea.config import run_folder
 from torchfovea.experiments.build import build_arena, build_cells, build_observer, build_scene_of, choice, number, whole
 from torchfovea.experiments.rollout import roll_out
+from torchfovea.experiments.settings import construct
 from torchfovea.files import write_csv, write_result
 from torchfovea.perception import Observer, Step, decide, new_mind, perceive
 from torchfovea.sensing.camera import image_camera
@@ -171,9 +172,8 @@ def _builders(cfg: DictConfig, device: str, wanted: Sequence[str]) -> list[Calla
     fusion = dataclasses.replace(full.fusion, fill=False, conflict=math.inf, half_life=math.inf)
     head = dataclasses.replace(full.head, encoder_deg=0.0)
     plain = dataclasses.replace(full, fusion=fusion, head=head, reward="inverse_range")
-    small = dataclasses.replace(
-        plain, retina=dataclasses.replace(full.retina, receptive_fields=whole(cfg, "small.receptive_fields"))
-    )
+    fewer = {**cfg.sensor, "receptive_fields": whole(cfg, "small.receptive_fields")}
+    small = dataclasses.replace(plain, retina=construct(LogPolar, fewer, "sensor"))
     few = OmegaConf.merge(cfg, {"memory": {"cells": whole(cfg, "small.cells")}})
     assert isinstance(few, DictConfig)
 

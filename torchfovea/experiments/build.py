@@ -2,42 +2,57 @@
 
 from __future__ import annotations
 
-import dataclasses
-from typing import Literal, cast
+from collections.abc import Callable
 
 import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from torchfovea.experiments.budgets import build_budget
+from torchfovea.experiments.named import build_named, name_of, targets_of
+from torchfovea.experiments.rewards import build_reward
 from torchfovea.experiments.settings import choice, construct, number, typed, whole
 from torchfovea.memory import sphere
 from torchfovea.memory.egosphere import Fusion, Prior
 from torchfovea.perception import Eligibility, Observer
 from torchfovea.sensing.camera import Camera, Fisheye, Pinhole
 from torchfovea.sensing.head import Head, fixate
-from torchfovea.sensing.layout import LogPolar, Retina, Uniform
+from torchfovea.sensing.layout import Retina
+from torchfovea.sensing.own_layout import check_retina
 from torchfovea.sensing.unscented import SigmaPoints
 from torchfovea.setting import SettingError, require
 from torchfovea.sim.arena import Arena
-from torchfovea.sim.scene import AttentionWorld, Cans, Room, Scene, build_scene
+from torchfovea.sim.motor import Motor
+from torchfovea.sim.rays import Renderer
+from torchfovea.sim.scene import Room, Scene, build_scene
 from torchfovea.sim.world import World
 from torchfovea.stereo.external import External
-from torchfovea.stereo.matchers import Matcher
+from torchfovea.stereo.matchers import Match, Matcher
 from torchfovea.stereo.sgbm import SGBM
 from torchfovea.stereo.sweep import Sweep
 
 __all__ = [
     "build_arena",
+    "build_camera",
     "build_cells",
+    "build_match",
+    "build_matcher",
+    "build_motor",
     "build_observer",
+    "build_renderer",
     "build_scene_of",
     "build_sensor",
     "choice",
     "construct",
+    "name_of",
     "number",
     "whole",
 ]
+
+# settings of the group sensor that are not the layout's own
+SENSOR = ("layout", "camera", "fov_deg", "sample", "source_px")
+# settings of the group matcher that are not a built-in matcher's own parameters
+MATCHER = ("name", "nearest_range_m", "source")
 
 # A direction counts as reachable if its point at this range is: the neck turns about E, the eyes sit beside it.
 REACH_RANGE_M = 1.0
@@ -45,16 +60,21 @@ REACH_RANGE_M = 1.0
 
 def build_sensor(cfg: DictConfig) -> tuple[Camera, Retina]:
     """The eyes' camera, in retinal pixels, and their retina."""
-    layout = choice(cfg, "sensor.layout", ("log_polar", "uniform"))
+    name_of(cfg, "sensor", "layout")
+    made = build_named(cfg, "sensor", "a layout of receptive fields", SENSOR, "layout")
+    # what a source names is a function without arguments that makes the layout
+    retina = check_retina(made() if OmegaConf.select(cfg, "sensor.source") is not None else made, "sensor")
+    return build_camera(cfg, retina.radius_px), retina
+
+
+def build_camera(cfg: DictConfig, radius_px: float) -> Camera:
+    """The eyes' camera, in pixels of a retina of a radius."""
     kind = choice(cfg, "sensor.camera", ("pinhole", "fisheye"))
     fov_deg = typed(cfg.sensor.fov_deg, "float", "sensor.fov_deg")
     widest = 180 if kind == "pinhole" else 360
     require(0 < fov_deg < widest, "sensor.fov_deg", fov_deg, f"more than 0 and less than {widest} for a {kind} camera")
     require(fov_deg >= 1e-3, "sensor.fov_deg", fov_deg, "at least 0.001 degrees")
-    retina: Retina = (
-        construct(LogPolar, cfg.sensor, "sensor") if layout == "log_polar" else construct(Uniform, cfg.sensor, "sensor")
-    )
-    return (Pinhole if kind == "pinhole" else Fisheye).from_fov(fov_deg, retina.radius_px), retina
+    return (Pinhole if kind == "pinhole" else Fisheye).from_fov(fov_deg, radius_px)
 
 
 def build_observer(cfg: DictConfig) -> Observer:
@@ -70,7 +90,7 @@ def build_observer(cfg: DictConfig) -> Observer:
         rotated=not printed,
         fusion=construct(Fusion, cfg.fusion, "fusion"),
         prior=construct(Prior, cfg.prior, "prior"),
-        reward=choice(cfg, "reward.name", ("inverse_range", "range")),
+        reward=build_reward(cfg),
         eligibility=construct(Eligibility, cfg.eligibility, "eligibility"),
     )
 
@@ -107,13 +127,37 @@ def build_cells(cfg: DictConfig, head: Head, generator: torch.Generator, dtype: 
 
 def build_scene_of(cfg: DictConfig, head: Head, seed: int) -> Scene:
     """The scene of a configuration's group `scene`."""
-    name = choice(cfg, "scene.name", ("attention_world", "cans"))
-    room = construct(Room, cfg.scene.room, "scene.room") if "room" in cfg.scene else Room()
-    fields = {key: value for key, value in cfg.scene.items() if key not in ("name", "room")}
-    params = (
-        construct(AttentionWorld, fields, "scene") if name == "attention_world" else construct(Cans, fields, "scene")
-    )
-    return build_scene(dataclasses.replace(params, room=room), seed, head)
+    name_of(cfg, "scene")
+    if "room" in cfg.scene and "_target_" not in cfg.scene.room:  # as scene files were before _target_
+        merged = OmegaConf.merge(cfg, {"scene": {"room": {"_target_": f"{Room.__module__}.{Room.__name__}"}}})
+        assert isinstance(merged, DictConfig)
+        cfg = merged
+    return build_scene(build_named(cfg, "scene", "a function (seed, head) that returns a Scene"), seed, head)
+
+
+def build_renderer(cfg: DictConfig) -> Renderer:
+    """What draws the pictures."""
+    name_of(cfg, "renderer")
+    form = "a function (scene, R, t, camera, size_px) that returns a Frame"
+    renderer: Renderer = build_named(cfg, "renderer", form)
+    require(callable(renderer), "renderer", type(renderer).__name__, form)
+    return renderer
+
+
+def build_motor(cfg: DictConfig) -> Callable[[Scene], Motor]:
+    """What turns the head of a scene."""
+    name_of(cfg, "motor")
+    form = "a motor that has move(head, before, command), or a function of the scene's MuJoCo model that returns one"
+    made = build_named(cfg, "motor", form)
+    moves = callable(getattr(made, "move", None))
+    require(moves or callable(made), "motor", type(made).__name__, form)
+
+    def motor_of(scene: Scene) -> Motor:
+        motor: Motor = made if moves and not isinstance(made, type) else made(scene.model)
+        require(callable(getattr(motor, "move", None)), "motor", type(motor).__name__, form)
+        return motor
+
+    return motor_of
 
 
 def build_arena(cfg: DictConfig, observer: Observer, seed: int) -> Arena:
@@ -122,19 +166,39 @@ def build_arena(cfg: DictConfig, observer: Observer, seed: int) -> Arena:
     fidelity = choice(cfg, "fidelity", ("photometric", "geometric"))
     world = World(
         scene,
-        renderer=cast(Literal["rays", "gl"], choice(cfg, "renderer.name", ("rays", "gl"))),
-        motor=cast(Literal["instant", "physics"], choice(cfg, "motor", ("instant", "physics"))),
+        renderer=build_renderer(cfg),
+        motor=build_motor(cfg)(scene),
         camera=observer.camera,
         source_px=whole(cfg, "sensor.source_px", 16),
         radius_px=observer.retina.radius_px,
     )
-    matcher = build_matcher(cfg)  # checked even where it is not used
+    match = build_match(cfg)  # checked even where it is not used
     sample = None if OmegaConf.select(cfg, "sensor.sample") is None else whole(cfg, "sensor.sample", 16)
-    return Arena(world, observer, None if fidelity == "geometric" else matcher, sample, seed)
+    return Arena(world, observer, None if fidelity == "geometric" else match, sample, seed)
+
+
+def build_match(cfg: DictConfig) -> Match:
+    """The stereo matcher of two verged eyes, built in or a user's own."""
+    name_of(cfg, "matcher")
+    form = "a function (left, right, rig, camera, retina, budget) that returns (Correspondences, found)"
+    target = OmegaConf.select(cfg, "matcher._target_") or targets_of("matcher", "name").get(cfg.matcher.name)
+    ours = isinstance(target, str) and target.startswith("torchfovea.")
+    made = build_named(cfg, "matcher", form, MATCHER if ours else ("name",))
+    if isinstance(made, SGBM | Sweep | External):
+        return Matcher(made, number(cfg, "matcher.nearest_range_m"), cfg.matcher.get("source"))
+    require(callable(made), "matcher", type(made).__name__, form)
+    match: Match = made
+    return match
 
 
 def build_matcher(cfg: DictConfig) -> Matcher:
-    """The stereo matcher."""
-    kinds: dict[str, type[SGBM | Sweep | External]] = {"sgbm": SGBM, "sweep": Sweep, "external": External}
-    params = construct(kinds[choice(cfg, "matcher.name", tuple(kinds))], cfg.matcher, "matcher")
-    return Matcher(params, number(cfg, "matcher.nearest_range_m"), cfg.matcher.get("source"))
+    """The stereo matcher, where it must be one that also matches rectified pairs.
+
+    Raises:
+        SettingError: for a user's own whole matcher.
+    """
+    matcher = build_match(cfg)
+    expected = "sgbm, sweep or external; one of your own matches in search"
+    require(isinstance(matcher, Matcher), "matcher", OmegaConf.select(cfg, "matcher.name"), expected)
+    assert isinstance(matcher, Matcher)
+    return matcher

@@ -15,7 +15,7 @@ from rich.table import Table
 from torch import Tensor
 
 from torchfovea.config import run_folder
-from torchfovea.experiments.build import build_sensor, construct, number, whole
+from torchfovea.experiments.build import build_camera, construct, number, whole
 from torchfovea.experiments.honesty import CHUNK, plan_cases, plan_planes, propagate, realise, wholes
 from torchfovea.experiments.manifest import complete, finished
 from torchfovea.experiments.progress import progress_bar
@@ -106,8 +106,12 @@ def _sensors(cfg: DictConfig) -> dict[str, PlaneSensor]:
     """Both sensors in the paper's reading: retinal noise alone."""
     baseline = number(cfg, "baseline_m")
     alone = Budget(number(cfg, "budget.sigma_over_width"), None, 0.0)
-    both = {name: build_sensor(OmegaConf.create({"sensor": {**cfg.sensor, "layout": name}})) for name in SENSORS}
-    return {name: PlaneSensor(camera, retina, baseline, alone) for name, (camera, retina) in both.items()}
+    kinds: tuple[type[LogPolar] | type[Uniform], ...] = (LogPolar, Uniform)
+    retinas = [construct(kind, cfg.sensor, "sensor") for kind in kinds]
+    return {
+        name: PlaneSensor(build_camera(cfg, retina.radius_px), retina, baseline, alone)
+        for name, retina in zip(SENSORS, retinas, strict=True)
+    }
 
 
 def _with(sensor: PlaneSensor, budget: Budget) -> PlaneSensor:
@@ -236,7 +240,7 @@ def _draw(
 ) -> None:
     from torchfovea.pictures.sensor import draw_fig5, draw_layouts
 
-    fields = sensor.retina.receptive_fields
+    fields = cfg.sensor.receptive_fields
     title = (
         f"Fig. 5: {fields} receptive fields, field of view {cfg.sensor.fov_deg:g}°, baseline {sensor.baseline_m:g} m"
     )

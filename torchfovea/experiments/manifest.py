@@ -18,7 +18,7 @@ __all__ = ["MANIFEST", "complete", "config_hash", "finished", "read_result", "re
 
 MANIFEST = "manifest.json"
 # what does not change a run's figures
-INCIDENTAL = ("workers", "device", "batch", "picture")
+INCIDENTAL = ("workers", "backend", "device", "batch", "picture", "trust")
 
 
 def config_hash(cfg: DictConfig) -> str:

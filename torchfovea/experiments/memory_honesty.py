@@ -20,7 +20,6 @@ from torchfovea.perception import Mind, Observer, new_mind, perceive
 from torchfovea.sensing.head import Gaze, eyes
 from torchfovea.setting import require
 from torchfovea.sim.arena import Arena
-from torchfovea.stereo.matchers import match_eyes
 from torchfovea.stereo.rig import verged
 from torchfovea.studies.significance import bootstrap_interval
 
@@ -127,7 +126,7 @@ def _look(seeing: dict[str, Sensor], gaze: Gaze, generator: torch.Generator) -> 
                 pictures = [frame.image for frame in arena.world.images(gaze)]
             left, right = pictures
             rig, budget = verged(gaze.vergence, observer.head.baseline_m), observer.budget
-            matches, _ = match_eyes(arena.matcher, left, right, rig, observer.camera, observer.retina, budget)
+            matches, _ = arena.matcher(left, right, rig, observer.camera, observer.retina, budget)
         pose = eyes(observer.head, gaze)
         for n, mind in minds.items():
             seeing[name].minds[n] = perceive(observer, mind, matches, pose)

@@ -158,8 +158,9 @@ def study_fusion(cfg: DictConfig, rows: Rows) -> None:
     rows.labels, rows.names = ("sensor", "fusion", "saccades"), COLUMNS
     base = build_observer(cfg)
     saccades, seed = whole(cfg, "saccades"), whole(cfg, "seed", 0)
+    fields = whole(cfg, "sensor.receptive_fields", 16)
     retinas: dict[str, Retina] = {
-        "log_polar": LogPolar(base.retina.receptive_fields), "uniform": Uniform(base.retina.receptive_fields)
+        "log_polar": LogPolar(fields), "uniform": Uniform(fields)
     }  # fmt: skip
     marks = sorted({min(5, saccades), saccades})
     for sensor, retina in retinas.items():

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
-from concurrent.futures import as_completed
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +15,13 @@ from rich.table import Table
 
 from torchfovea.config import run_folder
 from torchfovea.experiments.build import whole
-from torchfovea.experiments.cells import METRICS, Task, cells_of, run_task, task_name
+from torchfovea.experiments.cells import METRICS, Task, cells_of, config_folders, run_task, task_name
 from torchfovea.experiments.claims import Claim, Verdict, judge, read_claims, select
 from torchfovea.experiments.fig5 import judge_fig5
 from torchfovea.experiments.manifest import complete, finished
+from torchfovea.experiments.parallel import spread, workers_of
 from torchfovea.experiments.progress import progress_bar
 from torchfovea.experiments.report import write_report
-from torchfovea.experiments.workers import worker_pool
 from torchfovea.files import write_csv, write_json
 from torchfovea.mistakes import describe
 from torchfovea.setting import SettingError
@@ -47,7 +46,7 @@ def run(cfg: DictConfig) -> float:
     plain: Any = OmegaConf.to_container(cfg, resolve=True)
     claims = read_claims(plain["claims"])
     start = time.perf_counter()
-    rows = _episodes(cells_of(cfg), folder / "cells", whole(cfg, "workers"))
+    rows = _episodes(cells_of(cfg), folder / "cells", *workers_of(cfg))
     seconds = time.perf_counter() - start
     write_csv(folder / "episodes.csv", EPISODE_COLUMNS, [[row[c] for c in EPISODE_COLUMNS] for row in rows])
     counting = select(rows, plain["counts"])
@@ -87,7 +86,7 @@ def _elsewhere(claims: list[Claim], rows: list[Row], plain: Row) -> dict[str, di
     return found
 
 
-def _episodes(tasks: list[Task], folder: Path, workers: int) -> list[Row]:
+def _episodes(tasks: list[Task], folder: Path, workers: int, backend: str) -> list[Row]:
     """All rows: of the tasks already complete in the folder, and of the others, run now.
 
     Raises:
@@ -104,7 +103,8 @@ def _episodes(tasks: list[Task], folder: Path, workers: int) -> list[Row]:
     failed = []
     with progress_bar() as progress:
         bar = progress.add_task("reproduce", total=len(missing))
-        for task, outcome in _outcomes(missing, workers):
+        for k, outcome in spread(partial(run_task, folders=config_folders()), missing, workers, backend):
+            task = missing[k]
             name = task_name(task)
             if isinstance(outcome, Exception):
                 line = describe(outcome, task.overrides) or f"{type(outcome).__name__}: {outcome}"
@@ -132,29 +132,6 @@ def _read(path: Path, task: Task) -> list[Row]:
     if not complete:
         raise SettingError(f"{path} = corrupt: expected the rows of its episodes; remove it to run them again")
     return rows
-
-
-def _outcomes(tasks: list[Task], workers: int) -> Iterator[tuple[Task, list[Row] | Exception]]:
-    """Each task with its rows or its error, as they come."""
-    if workers == 1:
-        for task in tasks:
-            try:
-                yield task, run_task(task)
-            except Exception as error:
-                yield task, error
-        return
-    with worker_pool(workers) as pool:
-        waiting = {pool.submit(run_task, task): task for task in tasks}
-        try:
-            for future in as_completed(waiting):
-                broken = future.exception()
-                if broken is not None and not isinstance(broken, Exception):
-                    raise broken
-                yield waiting[future], broken if isinstance(broken, Exception) else future.result()
-        except BaseException:
-            for future in waiting:
-                future.cancel()
-            raise
 
 
 def _print(stated: list[Row]) -> None:

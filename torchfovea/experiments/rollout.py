@@ -14,7 +14,8 @@ from torch import Tensor
 from torchfovea.arena import Look, Truth, stack
 from torchfovea.deciding.strategies import Strategy
 from torchfovea.episode import Episode, run_episode, run_episodes, stack_minds
-from torchfovea.experiments.build import build_arena, build_cells, build_scene_of, choice, number, whole
+from torchfovea.experiments.build import build_arena, build_cells, build_motor, build_scene_of, name_of
+from torchfovea.experiments.settings import choice, number, whole
 from torchfovea.experiments.strategy import build_stop, build_strategy
 from torchfovea.perception import Mind, Observer, Step, new_mind
 from torchfovea.sensing.head import Head
@@ -30,7 +31,7 @@ StrategyFor = Callable[[Sequence[Truth]], Strategy]
 
 def batched(cfg: DictConfig) -> bool:
     """Whether the episodes of a configuration can advance together."""
-    return cfg.fidelity == "geometric" and cfg.motor == "instant"
+    return bool(cfg.fidelity == "geometric" and name_of(cfg, "motor") == "instant")
 
 
 def device_of(cfg: DictConfig) -> str:
@@ -100,7 +101,7 @@ def _start(settings: str, observer: Observer, seed: int) -> tuple[Mind, Tensor]:
 
 def prepare(cfg: DictConfig, observer: Observer, seed: int) -> tuple[Scene, Mind, Truth, torch.Generator]:
     """What an episode starts from; scenes and memories are kept for the next call with the same settings."""
-    scene = _scene(OmegaConf.to_yaml(OmegaConf.masked_copy(cfg, ["scene"]), resolve=True), observer.head, seed)
+    scene = _scene(OmegaConf.to_yaml(OmegaConf.masked_copy(cfg, ["scene", "trust"]), resolve=True), observer.head, seed)
     plain = dataclasses.replace(observer, acquisition=Observer().acquisition)
     memory = OmegaConf.masked_copy(_aimed(cfg, scene), ["memory"])
     mind, state = _start(OmegaConf.to_yaml(memory, resolve=True), plain, seed)
@@ -137,7 +138,7 @@ def roll_out(
     return run_episodes(
         dataclasses.replace(observer, acquisition=chosen),
         mind,
-        GeometricArenas(scenes, observer, sample_of(cfg), device, seeds=seeds),
+        GeometricArenas(scenes, observer, sample_of(cfg), device, build_motor(cfg)(scenes[0]), seeds),
         truths,
         whole(cfg, "saccades"),
         generators,

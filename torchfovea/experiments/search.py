@@ -14,12 +14,13 @@ from rich.table import Table
 from torchfovea.arena import Look
 from torchfovea.config import run_folder
 from torchfovea.episode import Episode
-from torchfovea.experiments.build import build_matcher, build_observer, choice, number, whole
+from torchfovea.experiments.build import build_match, build_motor, build_observer
 from torchfovea.experiments.manifest import complete, finished
+from torchfovea.experiments.parallel import spread, workers_of
 from torchfovea.experiments.progress import progress_bar
 from torchfovea.experiments.rollout import batched, device_of, one_episode, roll_out, sample_of
+from torchfovea.experiments.settings import choice, number, whole
 from torchfovea.experiments.strategy import build_stop, build_strategy
-from torchfovea.experiments.workers import worker_pool
 from torchfovea.files import write_csv
 from torchfovea.metrics import phantom
 from torchfovea.perception import Observer, Step
@@ -43,11 +44,11 @@ def run(cfg: DictConfig) -> float:
     episodes, saccades, seed = whole(cfg, "episodes"), whole(cfg, "saccades"), whole(cfg, "seed", 0)
     observer, folder = build_observer(cfg), run_folder()
     choice(cfg, "fidelity", ("photometric", "geometric"))
-    choice(cfg, "motor", ("instant", "physics")), choice(cfg, "renderer.name", ("rays", "gl"))
-    device_of(cfg), sample_of(cfg), whole(cfg, "batch"), whole(cfg, "workers"), number(cfg, "far_m")
+    device_of(cfg), sample_of(cfg), whole(cfg, "batch"), workers_of(cfg), number(cfg, "far_m")
     number(cfg, "near_target_m"), build_stop(cfg)
     require(isinstance(cfg.picture, bool), "picture", cfg.picture, "true or false")
-    build_strategy(cfg, observer), build_matcher(cfg)  # mistakes come first, also in what is not used
+    # mistakes come first, also in what is not used
+    build_strategy(cfg, observer), build_match(cfg), build_motor(cfg)
     done = finished(cfg, folder)
     if done is not None:
         return done
@@ -57,8 +58,8 @@ def run(cfg: DictConfig) -> float:
     with progress_bar() as progress:
         task = progress.add_task("search", total=episodes * saccades)
 
-        def advance(count: int) -> Callable[[int, Look, Step], None]:
-            return lambda t, look, step: progress.update(task, advance=count)
+        def advance(count: int) -> None:
+            progress.update(task, advance=count)
 
         for k, row, course, episode in _episodes(cfg, observer, [seed + k for k in range(episodes)], advance):
             last = episode
@@ -79,46 +80,46 @@ Outcome = tuple[int, tuple[Any, ...], list[tuple[Any, ...]], Episode | None]
 
 
 def _episodes(
-    cfg: DictConfig, observer: Observer, seeds: list[int], advance: Callable[[int], Callable[[int, Look, Step], None]]
+    cfg: DictConfig, observer: Observer, seeds: list[int], advance: Callable[[int], None]
 ) -> Iterator[Outcome]:
     """Number, figures and course of every episode in order; the last one's episode itself besides."""
-    workers, final = whole(cfg, "workers"), len(seeds) - 1
+    (workers, backend), final = workers_of(cfg), len(seeds) - 1
     if batched(cfg):
         size = whole(cfg, "batch")
         for start in range(0, len(seeds), size):
             part = seeds[start : start + size]
-            together = roll_out(cfg, observer, part, each=advance(len(part)))
+            together = roll_out(cfg, observer, part, each=_each(advance, len(part)))
             for k, episode in enumerate(together, start):
                 yield k, episode_row(episode), saccade_rows(episode), episode if k == final else None
         return
     if workers == 1 or final == 0:
         for k, seed in enumerate(seeds):
-            episode = one_episode(cfg, observer, seed, advance(1))
+            episode = one_episode(cfg, observer, seed, _each(advance, 1))
             yield k, episode_row(episode), saccade_rows(episode), episode if k == final else None
         return
-    # The last episode runs here, where it is drawn; the others in processes of their own.
     settings = OmegaConf.to_yaml(OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"]), resolve=True)
-    with worker_pool(workers) as pool:
-        waiting = [pool.submit(_elsewhere, settings, seed) for seed in seeds[:-1]]
-        try:
-            last = one_episode(cfg, observer, seeds[-1], advance(1))
-            for k, future in enumerate(waiting):
-                row, course = future.result()
-                advance(whole(cfg, "saccades"))(0, last.look, last.step)
-                yield k, row, course, None
-        except BaseException:
-            for future in waiting:
-                future.cancel()
-            raise
-    yield final, episode_row(last), saccade_rows(last), last
+    outcomes: dict[int, Outcome] = {}
+    work = [(settings, k, seed, k == final) for k, seed in enumerate(seeds)]
+    for k, outcome in spread(_elsewhere, work, workers, backend):
+        if isinstance(outcome, Exception):
+            raise outcome
+        advance(whole(cfg, "saccades"))
+        outcomes[k] = outcome
+    yield from (outcomes[k] for k in range(len(seeds)))
 
 
-def _elsewhere(settings: str, seed: int) -> tuple[tuple[Any, ...], list[tuple[Any, ...]]]:
-    """An episode in a process of its own."""
+def _each(advance: Callable[[int], None], count: int) -> Callable[[int, Look, Step], None]:
+    """What an episode calls after every decision: so many saccades are done."""
+    return lambda t, look, step: advance(count)
+
+
+def _elsewhere(work: tuple[str, int, int, bool]) -> Outcome:
+    """An episode in a process of its own: its settings, number and seed, and whether it comes back whole."""
+    settings, k, seed, kept = work
     cfg = OmegaConf.create(settings)
     assert isinstance(cfg, DictConfig)
     episode = one_episode(cfg, build_observer(cfg), seed)
-    return episode_row(episode), saccade_rows(episode)
+    return k, episode_row(episode), saccade_rows(episode), episode if kept else None
 
 
 def episode_row(episode: Episode) -> tuple[Any, ...]:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchfovea.config import run_folder
 from torchfovea.experiments.budgets import build_budget
-from torchfovea.experiments.build import build_matcher, build_sensor, choice
+from torchfovea.experiments.build import build_matcher, build_sensor, choice, name_of
 from torchfovea.experiments.images import write_ply
 from torchfovea.experiments.pairs import Pair, gaze_of, load_pair
 from torchfovea.experiments.sense_report import beside, figures_of, read_map
@@ -57,7 +57,7 @@ class Sensed(NamedTuple):
 def run(cfg: DictConfig) -> float | None:
     """Sense a pair; the median depth error is what a sweeper sees, if there is truth."""
     refuse_unread("sensor.fov_deg", "sensor.camera", "sensor.sample")
-    every = choice(cfg, "sensor.layout", ("log_polar", "uniform", "every_pixel")) == "every_pixel"
+    every = name_of(cfg, "sensor", "layout") == "every_pixel"
     retina = None if every else build_sensor(cfg)[1]  # the field of view is the images' own
     matcher, budget = build_matcher(cfg), build_budget(cfg, pair=True)
     printed = choice(cfg, "budget.sigma_points", ("ours", "paper")) == "paper"

@@ -204,9 +204,19 @@ def scene_yaml(distribution: Distribution, region: tuple[float, float, float, fl
     fields = ("cans", "target_range_m", "azimuth_deg", "elevation_deg", "range_m", "can_radius_m", "can_height_m",
               "margin_m", "tries")  # fmt: skip
     same = {name: getattr(d, name) for name in fields}
-    content = {"name": "cans", "target_azimuth_deg": region[:2], "target_elevation_deg": region[2:], **same}
+    content = {
+        "name": "cans",
+        "_target_": "torchfovea.sim.scene.Cans",
+        "target_azimuth_deg": region[:2],
+        "target_elevation_deg": region[2:],
+        **same,
+    }
     walls = {name: getattr(d, name) for name in ("front_m", "back_m", "side_m", "height_m")}
-    content |= {"pole_radius_m": 0.012, "reach_margin_deg": 1.5, "room": {**walls, "furniture": True}}
+    content |= {
+        "pole_radius_m": 0.012,
+        "reach_margin_deg": 1.5,
+        "room": {"_target_": "torchfovea.sim.room.Room", **walls, "furniture": True},
+    }
     content |= {"outside_first_view": False, "first_view_deg": 90.0}
     plain = {name: list(value) if isinstance(value, tuple) else value for name, value in content.items()}
     return f"# The scenes of distribution={d.name}, for search scene=...\n" + OmegaConf.to_yaml(OmegaConf.create(plain))

@@ -116,11 +116,12 @@ def draw_episode(path: Path, episode: Episode, retina: Retina, title: str) -> No
             axes.imshow(np.asarray(picture).clip(0, 1))
             axes.set_title(f"{name} (last fixation at +)")
             _cross(axes, np.asarray(picture).shape[:2])
-        values, name = _found(shown.found, retina, left.shape[-1])
-        drawn = row[3].imshow(values, cmap="viridis")
         row[3].set_facecolor("0.85")
-        row[3].set_title(name)
-        figure.colorbar(drawn, ax=row[3], pad=0.015)
+        if isinstance(shown.found, Disparity | SweepRange):  # a user's own matcher may show nothing
+            values, name = _found(shown.found, retina, left.shape[-1])
+            drawn = row[3].imshow(values, cmap="viridis")
+            row[3].set_title(name)
+            figure.colorbar(drawn, ax=row[3], pad=0.015)
         for axes in row:
             axes.set_xticks([])
             axes.set_yticks([])

@@ -9,18 +9,52 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchfovea.sensing.lattice import BUDGET_TOLERANCE, disc_lattice, fovea_lattice
 from torchfovea.setting import require
 
 __all__ = ["LogPolar", "Retina", "Uniform", "cortical"]
 
 MOST = 10_000_000  # RFs of a retina
-BUDGET_TOLERANCE = 0.005  # a layout's count may differ from its budget by this share
 ASPECT_TOLERANCE = 5.0  # an RF may be at most so many times longer than wide, or wider than long
+
+
+@runtime_checkable
+class Retina(Protocol):
+    """Where N receptive fields lie on a retina, and how wide they are: what every layout offers, also a user's own.
+
+    A layout is compared and hashed by its settings (a frozen dataclass is), because what follows from it is kept. RFs
+    come narrow ones first: none is narrower than 0.6 times one before it.
+    """
+
+    @property
+    def count(self) -> int:
+        """N."""
+        ...
+
+    @property
+    def radius_px(self) -> float:
+        """Radius of the disc that holds the retina [px]; the images that it sees span it."""
+        ...
+
+    def centers_px(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Tensor:
+        """Centres of the RFs, (N, 2) [px]."""
+        ...
+
+    def width_px(self, px: Tensor) -> Tensor:
+        """RF width at any place of the retina, (..., 2) to (...) [px], positive."""
+        ...
+
+    def inside(self, px: Tensor) -> Tensor:
+        """Whether places (..., 2) [px] lie on the retina; bool (...)."""
+        ...
+
+    def __hash__(self) -> int: ...
 
 
 @dataclass(frozen=True)
@@ -110,7 +144,7 @@ class LogPolar:
     @property
     def fovea_pitch_px(self) -> float:
         """Spacing of the uniform fovea's lattice [px]; 0 without one."""
-        return self.rho_min_px / _fovea_lattice(self.fovea_count)[0] if self.fovea_count else 0.0
+        return self.rho_min_px / fovea_lattice(self.fovea_count)[0] if self.fovea_count else 0.0
 
     def centers_px(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Tensor:
         """Centres of the RFs, (N, 2) [px]. Built once; do not write into it."""
@@ -154,22 +188,22 @@ class Uniform:
     @property
     def pitch_px(self) -> float:
         """Spacing and width of the RFs [px]."""
-        return self.radius_px / _disc_lattice(self.receptive_fields)[0]
+        return self.radius_px / disc_lattice(self.receptive_fields)[0]
 
     @property
     def count(self) -> int:
         """The actual number of RFs, within 0.5% of the budget."""
-        return len(_disc_lattice(self.receptive_fields)[2])
+        return len(disc_lattice(self.receptive_fields)[2])
 
     @property
     def lattice(self) -> tuple[np.ndarray, tuple[float, float]]:
         """Columns and rows (N, 2) of the RFs on the whole-number lattice, and the axis' place on it."""
-        return _disc_lattice(self.receptive_fields)[2], _disc_lattice(self.receptive_fields)[1]
+        return disc_lattice(self.receptive_fields)[2], disc_lattice(self.receptive_fields)[1]
 
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns of the smallest image that holds the lattice; the disc does not fill its corners."""
-        columns, rows = np.ptp(_disc_lattice(self.receptive_fields)[2], axis=0) + 1
+        columns, rows = np.ptp(disc_lattice(self.receptive_fields)[2], axis=0) + 1
         return int(rows), int(columns)
 
     def centers_px(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Tensor:
@@ -183,9 +217,6 @@ class Uniform:
     def inside(self, px: Tensor) -> Tensor:
         """Whether places (..., 2) [px] lie on the retina; bool (...)."""
         return _square(px) <= self.radius_px**2
-
-
-Retina = LogPolar | Uniform
 
 
 def cortical(values: Tensor, retina: LogPolar) -> Tensor:
@@ -245,41 +276,7 @@ def _log_polar_numbers(retina: LogPolar) -> tuple[int, int, int]:
 
 
 @lru_cache(maxsize=64)
-def _disc_lattice(budget: int) -> tuple[float, tuple[float, float], np.ndarray]:
-    """The lattice points of a disc: its radius [pitches], the axis' place, the whole-number columns and rows (N, 2)."""
-    ideal = math.sqrt(budget / math.pi)
-    side = np.arange(-math.ceil(1.5 * ideal) - 1, math.ceil(1.5 * ideal) + 2)
-    rows, columns = (axis.ravel() for axis in np.meshgrid(side, side, indexing="ij"))
-    # a disc about a corner of four RFs is the most symmetric; others serve small budgets that no symmetric count meets
-    for axis in ((-0.5, -0.5), (0.0, 0.0), (-0.5, 0.0), (0.137, 0.291)):
-        radius = np.hypot(columns - axis[0], rows - axis[1])
-        steps = np.unique(np.round(radius, 9))
-        between = (steps[1:] + steps[:-1]) / 2
-        counts = np.searchsorted(np.sort(radius), between)
-        meets = np.abs(counts / budget - 1) <= BUDGET_TOLERANCE
-        if meets.any():
-            if abs((radius <= ideal).sum() / budget - 1) <= BUDGET_TOLERANCE:
-                limit = ideal
-            else:
-                limit = between[meets][np.argmin(np.abs(between[meets] - ideal))]
-            inside = radius <= limit
-            return float(limit), axis, np.stack([columns[inside], rows[inside]], -1)
-    raise AssertionError("the last axis has no symmetry, so that every count occurs")
-
-
-@lru_cache(maxsize=64)
-def _fovea_lattice(count: int) -> tuple[float, np.ndarray]:
-    """The lattice points nearest to the axis: the radius of their disc [pitches], and x, y (n, 2) by row and column."""
-    ideal = math.sqrt(count / math.pi)
-    reach = math.ceil(ideal) + 2
-    side = np.arange(-reach, reach) + 0.5
-    y, x = (axis.ravel() for axis in np.meshgrid(side, side, indexing="ij"))
-    nearest = np.sort(np.argsort(np.round(x * x + y * y, 6), kind="stable")[:count])
-    return max(ideal, 1.000001 * np.hypot(x, y)[nearest].max()), np.stack([x[nearest], y[nearest]], -1)
-
-
-@lru_cache(maxsize=64)
-def _centers(retina: Retina, device: torch.device, dtype: torch.dtype) -> Tensor:
+def _centers(retina: LogPolar | Uniform, device: torch.device, dtype: torch.dtype) -> Tensor:
     # kept for later calls, which may want gradients: never an inference tensor
     with torch.inference_mode(False), torch.no_grad():
         if isinstance(retina, Uniform):
@@ -290,6 +287,6 @@ def _centers(retina: Retina, device: torch.device, dtype: torch.dtype) -> Tensor
             theta = 2 * math.pi * (np.arange(retina.sectors) + 0.5) / retina.sectors
             px = np.stack([rho * np.cos(theta), rho * np.sin(theta)], -1).reshape(-1, 2)
             if retina.fovea_count:
-                px = np.concatenate([_fovea_lattice(retina.fovea_count)[1] * retina.fovea_pitch_px, px])
+                px = np.concatenate([fovea_lattice(retina.fovea_count)[1] * retina.fovea_pitch_px, px])
         # coordinates outermost in memory: both components of (N, 2) are contiguous
         return torch.as_tensor(np.ascontiguousarray(px.T)).to(device, dtype).mT

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,28 +20,11 @@ from torch import Tensor
 
 from torchfovea.gaussian import columns
 from torchfovea.sensing.layout import LogPolar, Retina, Uniform, cortical
+from torchfovea.sensing.sampling import place, read, sampling, wide
+from torchfovea.sensing.triangles import from_triangles
 from torchfovea.setting import require
 
 __all__ = ["LogPolar", "Retina", "Uniform", "cortical", "covered", "fovea", "interpolate", "reconstruct"]
-
-
-class Sampling(NamedTuple):
-    """Where a retina reads an image and its pyramid.
-
-    The P places are, in this order: RFs 0…N−1 at the finer of their two levels, then RFs `first`…N−1, those wide enough
-    to need a coarser one, at that. Layouts list narrow RFs first, so that every group is one slice. Coordinates are as
-    in `grid_sample`: −1…1 over the image for the places before `above`, over the stacked pyramid for the others.
-    """
-
-    levels: int  # above the image
-    first: int  # the first RF that needs two levels
-    above: int  # the first RF that does not read the image itself
-    blend: Tensor  # (N − first,), weight of the coarser level
-    grid: Tensor  # (P, 2), for a gaze at the image's pixel (0, 0)
-    gain: Tensor  # (P, 2), motion of the place per pixel of gaze
-    low: Tensor  # (P, 2), centres of the level's border pixels
-    high: Tensor  # (P, 2)
-    middle: Tensor  # (1, P, 2), the places for a gaze at the image's middle
 
 
 def fovea(image: Tensor, gaze_px: Tensor | None, retina: Retina, scale: float | None = None) -> Tensor:
@@ -55,7 +37,8 @@ def fovea(image: Tensor, gaze_px: Tensor | None, retina: Retina, scale: float | 
         scale: image pixels per retinal pixel; None lets the retina span the image's shorter side.
 
     Returns:
-        (B, C, N). An RF that looks outside the image gets the nearest border's value; `covered` tells which do not.
+        (B, C, N), in the image's type; half precision is read in float32, where a place is not rounded to whole pixels.
+        An RF that looks outside the image gets the nearest border's value; `covered` tells which do not.
 
     Raises:
         SettingError: for shapes or types that do not fit, or an image or gaze with NaN or infinite values.
@@ -65,22 +48,24 @@ def fovea(image: Tensor, gaze_px: Tensor | None, retina: Retina, scale: float | 
     scale = _checked_scale(image.shape[-2:], retina, scale)
     require(image.dim() == 4 and image.numel() > 0, "image.shape", tuple(image.shape), "(B, C, H, W)")
     require(image.is_floating_point(), "image.dtype", image.dtype, "a floating-point type")
+    given, image = image.dtype, image.to(wide(image.dtype))
     require(bool(image.detach().sum().isfinite()), "image", "NaN or infinite values", "finite values")
     height, width = image.shape[-2:]
-    plan = _sampling(retina, height, width, scale, image.device, image.dtype)
+    plan = sampling(retina, height, width, scale, image.device, image.dtype)
     if gaze_px is None:
-        grid = plan.middle
+        maps = plan.middle
     else:
         _check_gaze(gaze_px)
         fits = len(image) in (1, len(gaze_px))
         require(fits, "gaze_px.shape", tuple(gaze_px.shape), f"({len(image)}, 2), one per image")
-        grid = _place(plan, gaze_px.to(image))
-    values = _read(image, grid[:, : plan.above])
+        maps = place(plan, gaze_px.to(image))
+    values = read(image, maps[..., : plan.above])
     if plan.levels == 0:
-        return values
-    values = torch.cat([values, _read(_pyramid(image, plan.levels), grid[:, plan.above :])], -1)
-    wide = torch.lerp(values[..., plan.first : retina.count], values[..., retina.count :], plan.blend)
-    return torch.cat([values[..., : plan.first], wide], -1)
+        return values.to(given)
+    higher = read(_pyramid(image, plan.levels), maps[..., plan.above :])
+    fine, coarse = higher.split([retina.count - plan.above, retina.count - plan.first], -1)
+    blended = torch.lerp(torch.cat([values[..., plan.first :], fine], -1), coarse, plan.blend)
+    return torch.cat([values[..., : plan.first], blended], -1).to(given)
 
 
 def covered(retina: Retina, size: tuple[int, int], gaze_px: Tensor | None, scale: float | None = None) -> Tensor:
@@ -101,15 +86,16 @@ def covered(retina: Retina, size: tuple[int, int], gaze_px: Tensor | None, scale
         gaze_px = torch.tensor([[(width - 1) / 2, (height - 1) / 2]])
     _check_gaze(gaze_px)
     dtype = gaze_px.dtype if gaze_px.is_floating_point() else torch.get_default_dtype()
-    place = gaze_px.to(dtype)[:, None] + scale * retina.centers_px(gaze_px.device, dtype)
-    return ((place >= -0.5) & (place <= place.new_tensor([width - 0.5, height - 0.5]))).all(-1)
+    seen_px = gaze_px.to(dtype)[:, None] + scale * retina.centers_px(gaze_px.device, dtype)
+    return ((seen_px >= -0.5) & (seen_px <= seen_px.new_tensor([width - 0.5, height - 0.5]))).all(-1)
 
 
 def interpolate(values: Tensor, retina: Retina, px: Tensor) -> Tensor:
     """Values between the RFs, at any place of the retina.
 
     Bilinear in (log ρ, θ), with wrap-around in θ, on a log-polar retina, and on the lattice of a uniform one. From the
-    centre of ring 0 inward a log-polar retina without a uniform fovea goes over, linearly in ρ, to the ring's mean.
+    centre of ring 0 inward a log-polar retina without a uniform fovea goes over, linearly in ρ, to the ring's mean. On
+    any other layout linear over the triangles between neighbouring RFs (Delaunay's).
 
     Args:
         values: (B, C, N).
@@ -133,6 +119,8 @@ def interpolate(values: Tensor, retina: Retina, px: Tensor) -> Tensor:
     flat = px.detach().to(values).reshape(-1, 2)
     if isinstance(retina, Uniform):
         out = _from_lattice(values, retina, flat)
+    elif not isinstance(retina, LogPolar):
+        out = from_triangles(values, retina.centers_px("cpu", torch.float64), flat)
     else:
         out = _from_rings(values, retina, flat)
         if retina.fovea_count:
@@ -183,20 +171,6 @@ def _check_gaze(gaze_px: Tensor) -> None:
     require(bool(gaze_px.detach().isfinite().all()), "gaze_px", "NaN or infinite values", "finite pixels")
 
 
-def _place(plan: Sampling, gaze_px: Tensor) -> Tensor:
-    """Places (B, P, 2) for gazes (B, 2), kept within their level's border."""
-    grid = torch.addcmul(plan.grid, gaze_px[:, None], plan.gain)
-    return torch.maximum(torch.minimum(grid, plan.high), plan.low)
-
-
-def _read(image: Tensor, grid: Tensor) -> Tensor:
-    """(B, C, P) of an image (B or 1, C, H, W) at places (B or 1, P, 2)."""
-    if len(image) == 1:  # many gazes at one image are rows of one grid
-        return F.grid_sample(image, grid[None], padding_mode="border", align_corners=True)[0].transpose(0, 1)
-    grid = grid[:, None].expand(len(image), -1, -1, -1)
-    return F.grid_sample(image, grid, padding_mode="border", align_corners=True)[:, :, 0]
-
-
 def halve(image: Tensor) -> Tensor:
     """The next level of the pyramid, ⌈H/2⌉ × ⌈W/2⌉; replicated beyond the border."""
     return _halve_along(_halve_along(image, -2), -1) / 64
@@ -225,46 +199,6 @@ def _pyramid(image: Tensor, levels: int) -> Tensor:
     return torch.cat([F.pad(level, (0, width - level.shape[-1])) for level in pyramid], -2)
 
 
-@lru_cache(maxsize=32)
-def _sampling(
-    retina: Retina, height: int, width: int, scale: float, device: torch.device, dtype: torch.dtype
-) -> Sampling:
-    with torch.inference_mode(False), torch.no_grad():
-        centers = retina.centers_px("cpu", torch.float64)
-        level = (torch.log2(retina.width_px(centers) * scale) - 1).numpy()
-        levels = max(0, min(math.ceil(level.max()), int(math.log2(min(height, width)))))
-        # layouts list narrow RFs first (but for a few percent where a uniform fovea ends): the wide ones are one slice
-        level = np.maximum.accumulate(level.clip(0, levels))
-        first = int(np.argmax(level > 0)) if (level > 0).any() else retina.count
-        fine = np.minimum(np.floor(level), max(levels - 1, 0)).astype(int)
-        above = int(np.argmax(fine > 0)) if (fine > 0).any() else retina.count
-        sizes = [np.array([width, height])]
-        for _ in range(levels):
-            sizes.append((sizes[-1] + 1) // 2)
-        offsets = [np.zeros(2)] + [np.array([0, sum(s[1] for s in sizes[1:i])]) for i in range(1, levels + 1)]
-        extents = [sizes[0]] + [np.array([sizes[1][0], sum(s[1] for s in sizes[1:])]) for _ in range(levels)]
-        which = np.concatenate([fine, fine[first:] + 1])
-        px = scale * np.concatenate([centers.numpy(), centers.numpy()[first:]])
-        shrink = 0.5 ** which[:, None]
-        low = np.array(offsets)[which]
-        high = low + np.array(sizes)[which] - 1
-        # a pixel's side spans 2/(extent − 1) of grid_sample's coordinates; along one pixel any coordinate will do
-        unit = 2 / np.maximum(np.array(extents)[which] - 1, 1)
-        grid, gain, low, high, blend = (
-            torch.as_tensor(part).to(device, dtype)
-            for part in (
-                (px * shrink + 0.5 * shrink - 0.5 + low) * unit - 1,
-                shrink * unit,
-                low * unit - 1,
-                high * unit - 1,
-                (level - fine)[first:],
-            )
-        )
-        plan = Sampling(levels, first, above, blend, grid, gain, low, high, middle=grid)
-        gaze_px = torch.tensor([[(width - 1) / 2, (height - 1) / 2]], device=device, dtype=dtype)
-        return plan._replace(middle=_place(plan, gaze_px))
-
-
 def _from_rings(values: Tensor, retina: LogPolar, px: Tensor) -> Tensor:
     """(B, C, N) at px (P, 2)."""
     sectors = retina.sectors
@@ -283,7 +217,7 @@ def _from_rings(values: Tensor, retina: LogPolar, px: Tensor) -> Tensor:
     return _bilinear(image, column, row)
 
 
-def _from_lattice(values: Tensor, retina: Retina, px: Tensor) -> Tensor:
+def _from_lattice(values: Tensor, retina: LogPolar | Uniform, px: Tensor) -> Tensor:
     """(B, C, N) of a uniform retina, or of a uniform fovea, at px (P, 2)."""
     index, axis, pitch = _dense(retina, values.device)
     return _bilinear(values[..., index], px[:, 0] / pitch + axis[0], px[:, 1] / pitch + axis[1])
@@ -292,13 +226,11 @@ def _from_lattice(values: Tensor, retina: Retina, px: Tensor) -> Tensor:
 def _bilinear(image: Tensor, column: Tensor, row: Tensor) -> Tensor:
     """(B, C, H, W) at (P,) columns and rows; the border's value beyond it."""
     height, width = image.shape[-2:]
-    grid = torch.stack([column * (2 / (width - 1)) - 1, row * (2 / (height - 1)) - 1], -1)
-    grid = grid[None, None].expand(len(image), -1, -1, -1)
-    return F.grid_sample(image, grid, padding_mode="border", align_corners=True)[:, :, 0]
+    return read(image, torch.stack([column * (2 / (width - 1)) - 1, row * (2 / (height - 1)) - 1])[:, None])
 
 
 @lru_cache(maxsize=64)
-def _dense(retina: Retina, device: torch.device) -> tuple[Tensor, tuple[float, float], float]:
+def _dense(retina: LogPolar | Uniform, device: torch.device) -> tuple[Tensor, tuple[float, float], float]:
     """The square image that holds a disc's lattice: which RF each pixel shows, the axis' column and row, the pitch.
 
     Corners show the nearest RF of their row.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ from torchfovea.sensing.geometric import correspond_points
 from torchfovea.sensing.head import Gaze, eyes
 from torchfovea.sim.truth import truth_of
 from torchfovea.sim.world import World
-from torchfovea.stereo.matchers import Matcher, match_eyes
+from torchfovea.stereo.matchers import Match, checked_matches
 from torchfovea.stereo.rig import verged
 from torchfovea.stereo.sweep import SweepRange
 
@@ -28,12 +28,12 @@ class Pictures(NamedTuple):
     Attributes:
         left: the left eye's image, (3, H, W) in [0, 1].
         right: the right eye's.
-        found: what the matcher found, of the rectified view or along the left rays.
+        found: what the matcher found, of the rectified view or along the left rays; of a user's own, anything.
     """
 
     left: Tensor
     right: Tensor
-    found: Disparity | SweepRange
+    found: Disparity | SweepRange | Any
 
 
 class Arena:
@@ -51,7 +51,7 @@ class Arena:
         self,
         world: World,
         observer: Observer,
-        matcher: Matcher | None,
+        matcher: Match | None,
         sample: int | None = None,
         seed: int = 0,
     ) -> None:
@@ -83,8 +83,9 @@ class Arena:
         if self.matcher is not None:
             left, right = self.world.images(gaze)
             rig = verged(believed.vergence, observer.head.baseline_m)
-            matches, found = match_eyes(
-                self.matcher, left.image, right.image, rig, observer.camera, observer.retina, observer.budget
+            matches, found = checked_matches(
+                self.matcher(left.image, right.image, rig, observer.camera, observer.retina, observer.budget),
+                observer.retina,
             )
             chosen = draw_fields(observer.retina.count, self.sample, generator)
             if chosen is not None:

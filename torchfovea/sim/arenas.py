@@ -15,7 +15,7 @@ from torchfovea.sensing.head import Gaze, clamp_gaze, cyclopean, eyes, to_ego
 from torchfovea.setting import require
 from torchfovea.sim.arena import draw_fields
 from torchfovea.sim.model import Scene
-from torchfovea.sim.motor import InstantMotor
+from torchfovea.sim.motor import InstantMotor, Motor
 from torchfovea.sim.room import FLOOR, TARGET
 from torchfovea.sim.trace import occluded, ranges, solids_of, trace
 
@@ -40,10 +40,13 @@ class GeometricArenas:
         observer: Observer,
         sample: int | None = None,
         device: torch.device | str = "cpu",
-        motor: InstantMotor | None = None,
+        motor: Motor | None = None,
         seeds: Sequence[int] | None = None,
     ) -> None:
-        self.observer, self.sample, self.motor = observer, sample, motor or InstantMotor()
+        instant = InstantMotor() if motor is None else motor
+        require(isinstance(instant, InstantMotor), "motor", type(instant).__name__, "an InstantMotor, in a batch")
+        assert isinstance(instant, InstantMotor)
+        self.observer, self.sample, self.motor = observer, sample, instant
         self.solids = solids_of(scenes, device)
         most = max(len(scene.kind) for scene in scenes)
         self.kind = torch.stack(

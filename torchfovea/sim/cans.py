@@ -11,9 +11,10 @@ import torch
 
 from torchfovea.sensing.head import Gaze, Head, cyclopean, eyes, fixate
 from torchfovea.setting import SettingError, require
-from torchfovea.sim.model import Scene
+from torchfovea.sim.compile import compile_solids, seeded, stand_at
+from torchfovea.sim.model import EgoPose, Scene
 from torchfovea.sim.rays import cast
-from torchfovea.sim.room import POLE, TARGET, Room, Solid, can, pole
+from torchfovea.sim.room import POLE, TARGET, Room, Solid, can, furnish, pole
 from torchfovea.sim.truth import reachable_directions
 
 __all__ = ["Cans", "place_cans", "target_in_sight"]
@@ -90,6 +91,21 @@ class Cans:
         require(0 <= self.reach_margin_deg <= 15, "scene.reach_margin_deg", self.reach_margin_deg, "0 to 15 degrees")
         require(10 <= self.first_view_deg <= 150, "scene.first_view_deg", self.first_view_deg, "10 to 150 degrees")
         require(self.tries >= 1, "scene.tries", self.tries, "at least 1")
+
+    def __call__(self, seed: int, head: Head) -> Scene:
+        """The scene; see `torchfovea.sim.scene.SceneRecipe`.
+
+        Raises:
+            SettingError: a region that admits no scene.
+        """
+        rng = seeded(seed)
+        for _ in range(self.tries):
+            room = furnish(self.room, rng)
+            scene = compile_solids(room + place_cans(self, head, rng, room), head, rng, self, seed)
+            if target_in_sight(scene, self.margin_m):
+                return stand_at(scene, EgoPose())
+        place = self.target_azimuth_deg
+        raise SettingError(f"scene.target_azimuth_deg = {place}: expected a region whose target can be seen")
 
 
 class _Candidates(NamedTuple):

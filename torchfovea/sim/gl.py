@@ -19,11 +19,11 @@ from torchfovea.sensing.camera import Camera, Pinhole
 from torchfovea.setting import SettingError, require
 from torchfovea.sim.backend import load_mujoco, loadable_gl
 from torchfovea.sim.model import Scene
-from torchfovea.sim.rays import MISS_RANGE_M, Frame
+from torchfovea.sim.rays import MISS_RANGE_M, Frame, Renderer
 from torchfovea.sim.room import CAN, FLOOR, FURNITURE, POLE, ROOM, TARGET, Solid, build_spec
 from torchfovea.sim.texture import colour
 
-__all__ = ["available_gl", "render"]
+__all__ = ["available_gl", "opengl", "render"]
 
 _TEXELS = {FLOOR: 1400, ROOM: 512, FURNITURE: 192, POLE: 24, CAN: 128, TARGET: 128}  # a side of a cube map
 _BAKED = 8192  # texels coloured at once
@@ -207,6 +207,17 @@ class _Painter:
 
 
 _painters: weakref.WeakKeyDictionary[Any, _Painter] = weakref.WeakKeyDictionary()
+
+
+def opengl() -> Renderer:
+    """`render`, on a machine that can.
+
+    Raises:
+        SettingError: no EGL or OSMesa.
+    """
+    expected = "a machine with EGL or OSMesa (renderer=rays needs neither)"
+    require(available_gl() is not None, "renderer", "gl", expected)
+    return render
 
 
 def render(scene: Scene, R: Tensor, t: Tensor, camera: Camera, size_px: int) -> Frame:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 
 from torchfovea.sensing.head import Gaze, Head, cyclopean
 from torchfovea.setting import require
 
-__all__ = ["InstantMotor", "Moved", "turned_deg"]
+__all__ = ["InstantMotor", "Motor", "Moved", "turned_deg"]
 
 
 class Moved(NamedTuple):
@@ -26,6 +26,20 @@ class Moved(NamedTuple):
     gaze: Gaze
     seconds: float
     degrees: float
+
+
+class Motor(Protocol):
+    """What turns the head: `InstantMotor`, `torchfovea.sim.servo.ServoMotor`, or anything else that moves like them."""
+
+    def move(self, head: Head, before: Gaze, command: Gaze) -> Moved:
+        """Execute a saccade.
+
+        Args:
+            head: of the scene.
+            before: where the head looks.
+            command: where it shall look, within the head's limits.
+        """
+        ...
 
 
 def turned_deg(head: Head, before: Gaze, after: Gaze) -> float:

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from torchfovea.sim.backend import load_mujoco
 from torchfovea.sim.model import Scene
 from torchfovea.sim.texture import colour
 
-__all__ = ["MISS_RANGE_M", "Frame", "RayHits", "cast", "render"]
+__all__ = ["MISS_RANGE_M", "Frame", "RayHits", "Renderer", "cast", "render"]
 
 MISS_RANGE_M = 1000.0
 """The range that a ray gets which meets nothing; its geom is -1."""
@@ -58,6 +58,22 @@ class Frame(NamedTuple):
     range_m: Tensor
     geom: Tensor
     normal: Tensor
+
+
+class Renderer(Protocol):
+    """What draws a picture: `render`, `torchfovea.sim.gl.render`, or any function like them."""
+
+    def __call__(self, scene: Scene, R: Tensor, t: Tensor, camera: Camera, size_px: int, /) -> Frame:
+        """A square picture.
+
+        Args:
+            scene: what to look at.
+            R: (3, 3), columns are the camera's axes in E.
+            t: (3,), the camera's centre in E [m].
+            camera: of the image; pixel centres are integers.
+            size_px: side of the picture.
+        """
+        ...
 
 
 @lru_cache(maxsize=1)

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
-import torch
 
 from torchfovea.sensing.head import Head
 from torchfovea.setting import require
-from torchfovea.sim.backend import load_mujoco
-from torchfovea.sim.cans import Cans, place_cans, target_in_sight
+from torchfovea.sim.cans import Cans
+from torchfovea.sim.compile import scene_of, seeded, stand_at
 from torchfovea.sim.model import EgoPose, Nearest, Scene
-from torchfovea.sim.room import Room, Solid, build_spec, can, furnish, paint_solids
-from torchfovea.sim.truth import find_nearest
+from torchfovea.sim.room import Room, Solid, can, furnish
 
-__all__ = ["AttentionWorld", "Cans", "EgoPose", "Nearest", "Room", "Scene", "build_scene", "stand_at"]
+__all__ = [
+    "AttentionWorld",
+    "Cans",
+    "EgoPose",
+    "Nearest",
+    "Room",
+    "Scene",
+    "SceneRecipe",
+    "build_scene",
+    "stand_at",
+]
 
 # the authors' world file, relative to the robot's base (x forward, y left); the last is the nearest
 _ATTENTION_CANS = ((1.811, 0.421), (0.860, -0.027), (0.661, -0.282), (0.710, -0.562), (0.453, 0.464))
@@ -43,45 +51,42 @@ class AttentionWorld:
         require(self.room.front_m >= 2.5, "room.front_m", self.room.front_m, "at least 2.5 m behind the farthest can")
         require(self.room.side_m >= 1.0, "room.side_m", self.room.side_m, "at least 1 m")
 
+    def __call__(self, seed: int, head: Head) -> Scene:
+        """The scene; see `SceneRecipe`."""
+        rng = seeded(seed)
+        return scene_of(_attention_solids(self, rng), head, rng, self, seed)
 
-def build_scene(
-    params: AttentionWorld | Cans, seed: int = 0, head: Head | None = None, pose: EgoPose | None = None
-) -> Scene:
+
+class SceneRecipe(Protocol):
+    """What builds a scene: `AttentionWorld`, `Cans`, or any function of a seed and a head."""
+
+    def __call__(self, seed: int, head: Head) -> Scene:
+        """The scene of a seed, with the robot at the world's origin; the same seed gives the same scene.
+
+        Args:
+            seed: >= 0.
+            head: whose reach the scene's truth is about, and whose height E has.
+        """
+        ...
+
+
+def build_scene(recipe: SceneRecipe, seed: int = 0, head: Head | None = None, pose: EgoPose | None = None) -> Scene:
     """Build a scene; the same arguments give the same scene.
 
     Args:
-        params: which scene. The seed changes only the textures of an `AttentionWorld`, and everything of `Cans`.
+        recipe: which scene. The seed changes only the textures of an `AttentionWorld`, and everything of `Cans`.
         seed: >= 0.
-        head: whose reach the scene's truth is about, and whose height E has; Vizzy's by default.
+        head: Vizzy's by default.
         pose: where the robot stands, by default at the world's origin, for which `Cans` are placed.
 
     Raises:
-        SettingError: a setting out of range, or a region of `Cans` that admits no scene.
+        SettingError: a setting out of range, a region of `Cans` that admits no scene, a recipe that returns none.
     """
-    require(isinstance(seed, int) and seed >= 0, "seed", seed, "a whole number >= 0")
-    head = Head() if head is None else head
-    rng = np.random.default_rng([seed, 1])
-    if isinstance(params, AttentionWorld):
-        scene = _compile(_attention_solids(params, rng), head, rng, params, seed)
-    elif isinstance(params, Cans):
-        for _ in range(params.tries):
-            room = furnish(params.room, rng)
-            scene = _compile(room + place_cans(params, head, rng, room), head, rng, params, seed)
-            if target_in_sight(scene, params.margin_m):
-                break
-        else:
-            require(False, "scene.target_azimuth_deg", params.target_azimuth_deg, "a region whose target can be seen")
-    else:
-        require(False, "scene", type(params).__name__, "AttentionWorld or Cans")
-    return stand_at(scene, EgoPose() if pose is None else pose)
-
-
-def stand_at(scene: Scene, pose: EgoPose) -> Scene:
-    """The same scene with the robot standing elsewhere; its truth is found anew."""
-    for name, value in pose._asdict().items():
-        require(math.isfinite(value), f"pose.{name}", value, "a finite number")
-    moved = replace(scene, pose=pose)
-    return replace(moved, nearest=find_nearest(moved))
+    name = getattr(recipe, "__name__", type(recipe).__name__)
+    require(callable(recipe), "scene", name, "AttentionWorld, Cans or a function (seed, head) that returns a Scene")
+    scene = recipe(seed, Head() if head is None else head)
+    require(isinstance(scene, Scene), "scene", f"{type(scene).__name__} from {name}(seed, head)", "a Scene")
+    return scene if pose is None else stand_at(scene, pose)
 
 
 def _attention_solids(params: AttentionWorld, rng: np.random.Generator) -> list[Solid]:
@@ -91,14 +96,3 @@ def _attention_solids(params: AttentionWorld, rng: np.random.Generator) -> list[
         shade = float(rng.uniform(-0.06, 0.06))
         solids.append(can(f"can_{i}", x, y, 0.0, params.can_radius_m, params.can_height_m, i == last, shade))
     return solids
-
-
-def _compile(solids: list[Solid], head: Head, rng: np.random.Generator, params: object, seed: int) -> Scene:
-    mujoco = load_mujoco()
-    model = build_spec(solids, head).compile()
-    data = tuple(mujoco.MjData(model) for _ in range(2))
-    for d in data:
-        mujoco.mj_forward(model, d)
-    kind = torch.tensor([solid.kind for solid in solids])
-    paint = paint_solids(solids, rng)
-    return Scene(model, (data[0], data[1]), tuple(solids), paint, kind, head, params=params, seed=seed)

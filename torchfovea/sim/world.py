@@ -10,11 +10,10 @@ from torch import Tensor
 from torchfovea.sensing.camera import Camera, Pinhole, image_camera
 from torchfovea.sensing.head import Gaze, Head, clamp_gaze, cyclopean, eyes, to_ego
 from torchfovea.setting import require
-from torchfovea.sim.gl import available_gl
-from torchfovea.sim.gl import render as render_gl
+from torchfovea.sim.gl import opengl
 from torchfovea.sim.model import Scene
-from torchfovea.sim.motor import InstantMotor, Moved
-from torchfovea.sim.rays import Frame, RayHits, cast, render
+from torchfovea.sim.motor import InstantMotor, Motor, Moved
+from torchfovea.sim.rays import Frame, RayHits, Renderer, cast, render
 from torchfovea.sim.servo import ServoMotor
 
 __all__ = ["Fixated", "Seen", "World"]
@@ -59,8 +58,8 @@ class World:
     Args:
         scene: from `torchfovea.sim.scene.build_scene`; its head is this world's.
         head: must equal the scene's; the scene's by default.
-        renderer: "rays", or "gl" for OpenGL through MuJoCo.
-        motor: "instant", "physics", or a motor object.
+        renderer: "rays", "gl" for OpenGL through MuJoCo, or a function (`torchfovea.sim.rays.Renderer`).
+        motor: "instant", "physics", or a motor (`torchfovea.sim.motor.Motor`).
         camera: of the retinas, in retinal pixels; 90 degrees over 100 px by default.
         source_px: side of the pictures.
         radius_px: of the retina, which the pictures span.
@@ -73,14 +72,15 @@ class World:
         self,
         scene: Scene,
         head: Head | None = None,
-        renderer: Literal["rays", "gl"] = "rays",
-        motor: Literal["instant", "physics"] | InstantMotor | ServoMotor = "instant",
+        renderer: Literal["rays", "gl"] | Renderer = "rays",
+        motor: Literal["instant", "physics"] | Motor = "instant",
         camera: Camera | None = None,
         source_px: int = 400,
         radius_px: float = 100.0,
     ) -> None:
         require(head is None or head == scene.head, "head", head, "the head that the scene was built for")
-        require(renderer in ("rays", "gl"), "renderer", renderer, "rays or gl")
+        drawn = callable(renderer) or renderer in ("rays", "gl")
+        require(drawn, "renderer", renderer, "rays, gl or a function (scene, R, t, camera, size_px)")
         require(isinstance(source_px, int) and 2 <= source_px <= 8192, "source_px", source_px, "2 to 8192 pixels")
         require(radius_px > 0, "radius_px", radius_px, "a positive number of pixels")
         self.scene = scene
@@ -88,18 +88,16 @@ class World:
         self.camera = Pinhole.from_fov(90.0, radius_px) if camera is None else camera
         self.source_px = source_px
         self.image_camera = image_camera(self.camera, radius_px, source_px)
-        if renderer == "gl":
-            backend = available_gl()
-            require(backend is not None, "renderer", "gl", "a machine with EGL or OSMesa (renderer=rays needs neither)")
-        self._render = render_gl if renderer == "gl" else render
-        self.motor: InstantMotor | ServoMotor
+        self._render: Renderer = opengl() if renderer == "gl" else render if isinstance(renderer, str) else renderer
+        self.motor: Motor
         if motor == "instant":
             self.motor = InstantMotor()
         elif motor == "physics":
             self.motor = ServoMotor(scene.model)
         else:
-            require(isinstance(motor, InstantMotor | ServoMotor), "motor", motor, "instant, physics or a motor")
-            assert isinstance(motor, InstantMotor | ServoMotor)
+            moves = callable(getattr(motor, "move", None))
+            require(moves, "motor", motor, "instant, physics or a motor that has move(head, before, command)")
+            assert not isinstance(motor, str)
             self.motor = motor
         zero = torch.zeros((), dtype=torch.float64)
         self.gaze = Gaze(zero, zero, zero)
@@ -117,6 +115,7 @@ class World:
         """
         command = clamp_gaze(self.head, self._one(gaze))
         moved = self.motor.move(self.head, self.gaze, command)
+        require(isinstance(moved, Moved), "motor", f"{type(moved).__name__} from move", "a torchfovea.sim.motor.Moved")
         self.gaze = moved.gaze
         return moved
 
@@ -127,6 +126,10 @@ class World:
             self._render(self.scene, r, t, self.image_camera, self.source_px)
             for r, t in ((pose.R_left, pose.t_left), (pose.R_right, pose.t_right))
         )
+        for frame in (left, right):
+            require(isinstance(frame, Frame), "renderer", type(frame).__name__, "a torchfovea.sim.rays.Frame")
+            shape = (3, self.source_px, self.source_px)
+            require(tuple(frame.image.shape) == shape, "renderer's image", tuple(frame.image.shape), str(shape))
         return left, right
 
     def fixated(self, gaze: Gaze | None = None) -> Fixated:

@@ -9,7 +9,6 @@ which adds to the right eye's budget; without a confidence c = 1. Nothing here i
 
 from __future__ import annotations
 
-import importlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -21,10 +20,11 @@ import torch
 from torch import Tensor
 
 from torchfovea.gaussian import columns
+from torchfovea.imported import load_function
 from torchfovea.sensing.camera import Camera, Pinhole
 from torchfovea.sensing.correspondence import Budget, Correspondences, Disparity
 from torchfovea.sensing.retina import Retina, fovea, interpolate
-from torchfovea.setting import SettingError, require
+from torchfovea.setting import require
 from torchfovea.stereo.confidence import read_clues
 from torchfovea.stereo.costs import left_eye
 from torchfovea.stereo.disparity_files import check_maps, load_disparity
@@ -89,13 +89,7 @@ def load_matcher(source: str, setting: str = "matcher.source") -> Matcher:
     Raises:
         SettingError: for another form, a module that does not import, or a name that is no function.
     """
-    module, colon, name = source.partition(":")
-    require(bool(module and colon and name), setting, source, "an existing file or package.module:function")
-    try:
-        found: Any = getattr(importlib.import_module(module), name, None)
-    except ImportError as error:
-        raise SettingError(f"{setting} = {source}: expected a module that can be imported ({error})") from error
-    require(callable(found), setting, source, f"a function {name} in {module}")
+    found: Matcher = load_function(source, setting, "an existing file or package.module:function")
     return found
 
 

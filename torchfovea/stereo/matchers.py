@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from torch import Tensor
 
@@ -17,11 +17,34 @@ from torchfovea.stereo.rig import StereoRig
 from torchfovea.stereo.sgbm import SGBM
 from torchfovea.stereo.sweep import Sweep, SweepRange, match_sweep, match_sweep_rectified
 
-__all__ = ["Matcher", "match_eyes", "match_pair"]
+__all__ = ["Match", "Matcher", "checked_matches", "match_eyes", "match_pair"]
+
+
+class Match(Protocol):
+    """What matches the pictures of two verged eyes: a `Matcher`, or any function like it."""
+
+    def __call__(
+        self, left: Tensor, right: Tensor, rig: StereoRig, camera: Camera, retina: Retina, budget: Budget, /
+    ) -> tuple[Correspondences, Any]:
+        """Match two pictures.
+
+        Args:
+            left: (3, H, W) in [0, 1].
+            right: of the same shape.
+            rig: how the eyes stand.
+            camera: both eyes', in retinal pixels; the pictures span the retina's disc.
+            retina: both eyes'.
+            budget: where a correspondence's standard deviation comes from; a matcher may know better.
+
+        Returns:
+            A correspondence for each receptive field of the left eye, in order, and what was found, to be drawn: a
+            `Disparity`, a `SweepRange` or None.
+        """
+        ...
 
 
 class Matcher(NamedTuple):
-    """A matcher with its parameters.
+    """A built-in matcher with its parameters; it is a `Match`.
 
     Attributes:
         params: their type says which matcher it is.
@@ -32,6 +55,31 @@ class Matcher(NamedTuple):
     params: SGBM | Sweep | External
     nearest_m: float = 0.3
     source: str | None = None
+
+    def __call__(
+        self, left: Tensor, right: Tensor, rig: StereoRig, camera: Camera, retina: Retina, budget: Budget, /
+    ) -> tuple[Correspondences, Disparity | SweepRange]:
+        """Match two verged eyes; see `Match` and `match_eyes`."""
+        return match_eyes(self, left, right, rig, camera, retina, budget)
+
+
+def checked_matches(answer: object, retina: Retina) -> tuple[Correspondences, Any]:
+    """What a `Match` returned, or an error under the setting `matcher`.
+
+    Raises:
+        SettingError: for anything but correspondences of the retina's receptive fields and what was found.
+    """
+    expected = "(Correspondences, found)"
+    pair = isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[0], Correspondences)
+    require(pair, "matcher", f"{type(answer).__name__} from (left, right, ...)", expected)
+    assert isinstance(answer, tuple)
+    matches = answer[0]
+    for name, lead in (("left_px", 2), ("right_px", 2), ("left_sigma_px", 1), ("right_sigma_px", 1), ("valid", 1)):
+        part = getattr(matches, name)
+        shape = (retina.count, 2)[:lead]
+        fits = isinstance(part, Tensor) and tuple(part.shape) == shape
+        require(fits, f"matcher's {name}", getattr(part, "shape", part), f"{shape}, one for each receptive field")
+    return matches, answer[1]
 
 
 def match_eyes(

@@ -2,7 +2,8 @@
 
 A log-polar retina becomes bands of rings by sectors, about an octave of RF widths each (the cortical image, closed
 along its sectors), and, where its RFs are narrower than a pixel of the source image, one square lattice of the
-source's pitch in their stead: finer places would only repeat each other. A uniform retina becomes one square lattice.
+source's pitch in their stead: finer places would only repeat each other. A uniform retina becomes one square lattice,
+and so does any other layout, at the pitch of its narrowest RF.
 """
 
 from __future__ import annotations
@@ -56,8 +57,11 @@ def sheets(retina: Retina, source_pitch_px: float, device: torch.device, dtype: 
     if isinstance(retina, Uniform):
         own = retina.pitch_px >= source_pitch_px
         parts = [_lattice(centers, max(retina.pitch_px, source_pitch_px), own)]
-    else:
+    elif isinstance(retina, LogPolar):
         parts = _cut(retina, centers, source_pitch_px)
+    else:
+        narrowest = float(retina.width_px(torch.from_numpy(centers)).min())
+        parts = [_lattice(centers, max(narrowest, source_pitch_px), own=False)]
     out = []
     with torch.inference_mode(False), torch.no_grad():
         for px, closed, rf, place in parts:

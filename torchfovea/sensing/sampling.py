@@ -1,0 +1,99 @@
+"""Where a retina reads an image and the pyramid above it, and the reading, by kornia."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchfovea.sensing.layout import Retina
+
+__all__ = ["Sampling", "place", "read", "sampling", "wide"]
+
+
+class Sampling(NamedTuple):
+    """Where a retina reads an image and its pyramid.
+
+    The P places are, in this order: RFs 0…N−1 at the finer of their two levels, then RFs `first`…N−1, those wide enough
+    to need a coarser one, at that. Layouts list narrow RFs first, so that every group is one slice. Coordinates, x and
+    y apart, run from −1 to 1 between the border pixels: of the image for the places before `above`, of the stacked
+    pyramid for the others.
+    """
+
+    levels: int  # above the image
+    first: int  # the first RF that needs two levels
+    above: int  # the first RF that does not read the image itself
+    blend: Tensor  # (N − first,), weight of the coarser level
+    maps: Tensor  # (2, 1, P), for a gaze at the image's pixel (0, 0)
+    gain: Tensor  # (2, 1, P), motion of the place per pixel of gaze
+    low: Tensor  # (2, 1, P), centres of the level's border pixels
+    high: Tensor  # (2, 1, P)
+    middle: Tensor  # (2, 1, P), the places for a gaze at the image's middle
+
+
+def wide(dtype: torch.dtype) -> torch.dtype:
+    """The type in which images of a type are read: at least float32."""
+    return torch.promote_types(dtype, torch.float32)
+
+
+def place(plan: Sampling, gaze_px: Tensor) -> Tensor:
+    """Places (2, B, P) for gazes (B, 2), kept within their level's border."""
+    maps = torch.addcmul(plan.maps, gaze_px.mT[..., None], plan.gain)
+    return torch.maximum(torch.minimum(maps, plan.high), plan.low)
+
+
+def read(image: Tensor, maps: Tensor) -> Tensor:
+    """(B, C, P) of an image (B or 1, C, H, W) at places (2, B or 1, P), the border's value beyond it."""
+    # kornia takes as long to import as this whole package; only who looks needs it
+    from kornia.geometry.transform import remap
+
+    one = len(image) == 1  # many gazes at one image are rows of one map
+    x, y = maps[:, None] if one else maps[:, :, None]
+    seen = remap(image, x, y, padding_mode="border", align_corners=True, normalized_coordinates=True)
+    return seen[0].transpose(0, 1) if one else seen[:, :, 0]
+
+
+@lru_cache(maxsize=32)
+def sampling(
+    retina: Retina, height: int, width: int, scale: float, device: torch.device, dtype: torch.dtype
+) -> Sampling:
+    """The plan of a retina on images of one size; built once."""
+    with torch.inference_mode(False), torch.no_grad():
+        centers = retina.centers_px("cpu", torch.float64)
+        level = (torch.log2(retina.width_px(centers) * scale) - 1).numpy()
+        levels = max(0, min(math.ceil(level.max()), int(math.log2(min(height, width)))))
+        # layouts list narrow RFs first (but for a few percent where a uniform fovea ends): the wide ones are one slice
+        level = np.maximum.accumulate(level.clip(0, levels))
+        first = int(np.argmax(level > 0)) if (level > 0).any() else retina.count
+        fine = np.minimum(np.floor(level), max(levels - 1, 0)).astype(int)
+        above = int(np.argmax(fine > 0)) if (fine > 0).any() else retina.count
+        sizes = [np.array([width, height])]
+        for _ in range(levels):
+            sizes.append((sizes[-1] + 1) // 2)
+        offsets = [np.zeros(2)] + [np.array([0, sum(s[1] for s in sizes[1:i])]) for i in range(1, levels + 1)]
+        extents = [sizes[0]] + [np.array([sizes[1][0], sum(s[1] for s in sizes[1:])]) for _ in range(levels)]
+        which = np.concatenate([fine, fine[first:] + 1])
+        px = scale * np.concatenate([centers.numpy(), centers.numpy()[first:]])
+        shrink = 0.5 ** which[:, None]
+        low = np.array(offsets)[which]
+        high = low + np.array(sizes)[which] - 1
+        # a pixel's side spans 2/(extent − 1) of these coordinates; along one pixel any coordinate will do
+        unit = 2 / np.maximum(np.array(extents)[which] - 1, 1)
+        maps, gain, low, high = (
+            torch.as_tensor(np.ascontiguousarray(part.T[:, None])).to(device, dtype)
+            for part in (
+                (px * shrink + 0.5 * shrink - 0.5 + low) * unit - 1,
+                shrink * unit,
+                low * unit - 1,
+                high * unit - 1,
+            )
+        )
+        blend = torch.as_tensor((level - fine)[first:]).to(device, dtype)
+        plan = Sampling(levels, first, above, blend, maps, gain, low, high, middle=maps)
+        gaze_px = torch.tensor([[(width - 1) / 2, (height - 1) / 2]], device=device, dtype=dtype)
+        # pairs side by side in memory: remap puts its x and y so, and is faster where they are
+        return plan._replace(middle=place(plan, gaze_px).permute(1, 2, 0).contiguous().permute(2, 0, 1))
