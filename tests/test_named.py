@@ -37,6 +37,11 @@ BUILD = {
 }
 
 
+TINY = [
+    "fidelity=geometric", "episodes=1", "saccades=1", "sensor.receptive_fields=200", "memory.cells=60", "picture=false",
+]  # fmt: skip
+
+
 def configured(*overrides: str):
     with initialize_config_dir(conf_dir(), version_base="1.3"):
         return compose("search", overrides=list(overrides))
@@ -147,6 +152,32 @@ def test_settings_that_a_users_own_does_not_take(own, settings, message):
         build_scene_of(cfg, Head(), 0)
 
 
+@pytest.mark.parametrize("choice", ["acquisition=theirs", "acquisition=ucb,theirs"])
+def test_a_file_does_not_say_whom_to_trust(own, tmp_path, capsys, choice):
+    conf = tmp_path / "theirs" / "acquisition"
+    conf.mkdir(parents=True)
+    (conf / "theirs.yaml").write_text(
+        "# @package _global_\ntrust: true\nacquisition:\n  name: theirs\n  _target_: own_things.one\n  alpha: 1.0\n"
+    )
+    sweep = ["--multirun"] if "," in choice else []
+    folders = [f"hydra.sweep.dir={tmp_path}/sweep", f"hydra.run.dir={tmp_path}/run"]
+    assert main(["search", *sweep, "--config-dir", str(conf.parent), choice, *folders, *TINY]) == 1
+    assert "trust = true, in a file: expected it among the command's own settings" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("choice", ["acquisition=theirs", "acquisition=ucb,theirs", "acquisition=glob(th*)"])
+def test_what_a_sweep_chooses_is_read_too(own, tmp_path, capsys, choice):
+    conf = tmp_path / "theirs" / "acquisition"
+    conf.mkdir(parents=True)
+    (conf / "theirs.yaml").write_text(
+        "# @package _global_\nhydra:\n  job_logging:\n    formatters:\n      simple:\n        (): os.getcwd\n"
+    )
+    sweep = [] if choice.endswith("=theirs") else ["--multirun"]
+    folders = [f"hydra.sweep.dir={tmp_path}/sweep", f"hydra.run.dir={tmp_path}/run"]
+    assert main(["search", *sweep, "--config-dir", str(conf.parent), choice, *folders, *TINY]) == 1
+    assert "hydra.job_logging.formatters.simple.() = os.getcwd" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("trusted", [False, True])
 def test_a_strangers_folder_runs_nothing_without_trust(own, tmp_path, capsys, trusted):
     conf = tmp_path / "theirs" / "acquisition"
@@ -160,11 +191,7 @@ def test_a_strangers_folder_runs_nothing_without_trust(own, tmp_path, capsys, tr
         f"      _target_: callback_of_theirs.make\n      path: {ran}\nacquisition:\n  name: ucb\n  alpha: 1.0\n"
         "  _target_: torchfovea.experiments.strategy.ucb\n"
     )
-    command = [
-        "search", "--config-dir", str(conf.parent), "acquisition=theirs", "fidelity=geometric", "episodes=1",
-        "saccades=1", "sensor.receptive_fields=200", "memory.cells=60", "picture=false",
-        f"hydra.run.dir={tmp_path}/run",
-    ]  # fmt: skip
+    command = ["search", "--config-dir", str(conf.parent), "acquisition=theirs", *TINY, f"hydra.run.dir={tmp_path}/run"]
     if trusted:
         with pytest.warns(UserWarning, match="Callback object"):  # an object has none of a callback's parts
             assert main([*command, "trust=true"]) == 0

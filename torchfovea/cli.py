@@ -235,11 +235,13 @@ def _job(command: str, overrides: list[str], full_error: bool) -> Callable[[Any]
         from torchfovea.config import run_folder
         from torchfovea.experiments.manifest import MANIFEST, record, unclaimed, withdraw
         from torchfovea.mistakes import describe, need
+        from torchfovea.trust import check_said
 
         folder = run_folder()
         settings = HydraConfig.get().job
         sweeping = not OmegaConf.is_missing(settings, "num")
         try:
+            check_said(cfg)
             if not COMMANDS[command].resumes:
                 unclaimed(folder)
             taken = COMMANDS[command].resumes and (folder / "result.json").exists()
