@@ -1,9 +1,12 @@
 """The reward that a configuration describes."""
 
+import csv
+
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
+from torchfovea.cli import main
 from torchfovea.config import conf_dir
 from torchfovea.experiments.rewards import build_reward
 from torchfovea.setting import SettingError
@@ -42,3 +45,18 @@ def test_a_users_own(tmp_path, monkeypatch):
 def test_a_bad_reward_names_its_setting(overrides, message):
     with pytest.raises(SettingError, match=message):
         build_reward(configured(*overrides))
+
+
+def test_search_seeks_a_point(tmp_path, capsys):
+    """The best cell of a search for a point to the left lies to the left of that of one to the right."""
+    best = []
+    for side in (0.6, -0.6):
+        command = [
+            "search", "fidelity=geometric", "episodes=1", "saccades=8", "sensor.receptive_fields=1500",
+            "memory.cells=600", "picture=false", "acquisition.alpha=0", "reward=nearest_to",
+            f"reward.point=[1.5,{side},0]", f"hydra.run.dir={tmp_path}/{side}",
+        ]  # fmt: skip
+        assert main(command) == 0, capsys.readouterr().err
+        with (tmp_path / str(side) / "saccades.csv").open() as file:
+            best.append(float(list(csv.DictReader(file))[-1]["pan_rad"]))
+    assert best[0] > 0.1 and best[1] < -0.1

@@ -14,7 +14,7 @@ from rich.table import Table
 from torchfovea.arena import Look
 from torchfovea.config import run_folder
 from torchfovea.episode import Episode
-from torchfovea.experiments.build import build_match, build_motor, build_observer
+from torchfovea.experiments.build import build_match, build_motor, build_observer, build_renderer, name_of
 from torchfovea.experiments.manifest import complete, finished
 from torchfovea.experiments.parallel import spread, workers_of
 from torchfovea.experiments.progress import progress_bar
@@ -44,6 +44,7 @@ def run(cfg: DictConfig) -> float:
     episodes, saccades, seed = whole(cfg, "episodes"), whole(cfg, "saccades"), whole(cfg, "seed", 0)
     observer, folder = build_observer(cfg), run_folder()
     choice(cfg, "fidelity", ("photometric", "geometric"))
+    build_renderer(cfg) if cfg.fidelity == "photometric" else name_of(cfg, "renderer")
     device_of(cfg), sample_of(cfg), whole(cfg, "batch"), workers_of(cfg), number(cfg, "far_m")
     number(cfg, "near_target_m"), build_stop(cfg)
     require(isinstance(cfg.picture, bool), "picture", cfg.picture, "true or false")
