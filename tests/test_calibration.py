@@ -48,7 +48,7 @@ RETINA = LogPolar(3000)
 
 def test_a_known_budget_is_recovered():
     spread = {"bend": 0.5, "gap": 0.25, "fringe": 0.3, "noise": 0.8, "claim": 1.7}
-    odds = {"outliers_bend": 0.6, "outliers_gap": 0.8, "outliers_fringe": 0.4, "outliers_hidden": 1.0}
+    odds = {"outliers_gap": 0.8, "outliers_hidden": 1.0}
     true = Budget(0.12, 400, 0.3, **spread, outliers=0.03, **odds, outliers_mismatch=2.0)
     sets = [observations(40_000, true, seed) for seed in range(8)]
     fit = fit_budget(sets, Budget())
@@ -77,7 +77,7 @@ def test_outliers_that_are_not_fitted_keep_their_share():
     true = Budget(0.12, 400, 0.3, claim=0.0, outliers=0.02)
     data = without_clues(observations(20_000, true))
     fit = fit_budget([data], Budget(), Likelihood(fit_outliers=False))
-    assert fit.budget.outliers == pytest.approx(0.02) and fit.budget.outliers_bend == 0
+    assert fit.budget.outliers == pytest.approx(0.02) and fit.budget.outliers_gap == 0
     assert fit.budget.match_px == pytest.approx(0.3, rel=0.1)
 
 
@@ -172,7 +172,7 @@ def test_weights_are_repetitions():
     data = observations(400, Budget(outliers=0.1), seed=5)
     times = torch.arange(400) % 3
     again = select(data, torch.repeat_interleave(torch.arange(400), times))
-    claims = [(sigma_of(d, Budget()), inlier_of(d, Budget(outliers=0.3, outliers_bend=1.0))) for d in (data, again)]
+    claims = [(sigma_of(d, Budget()), inlier_of(d, Budget(outliers=0.3, outliers_gap=1.0))) for d in (data, again)]
     weighted, repeated = judge(data, *claims[0], times), judge(again, *claims[1])
     for name in weighted.keys() - {"ause"}:
         assert weighted[name] == pytest.approx(repeated[name]), name

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import shlex
-import sys
 from dataclasses import asdict, replace
 from itertools import pairwise
 from pathlib import Path
@@ -224,9 +222,10 @@ def _write(path: Path, law: Budget, cfg: DictConfig, data: dict[str, Split], ang
     """The fitted budget as a file of the group `budget`."""
     simulated = [f"{cfg.scenes} scenes {cfg.scene.name}, {cfg.looks} looks each"] if cfg.scenes else []
     pairs = [name.replace("real_left", "its other half").replace("real", "half a pair") for name in data]
-    command = " ".join(shlex.quote(Path(a).name if "=" not in a else a) for a in sys.argv[1:] if "run.dir" not in a)
+    command = " ".join(HydraConfig.get().overrides.task)
     comments = [
-        f"Fitted by: torchfovea {command} (torchfovea.sensing.correspondence.Budget says what the numbers are)",
+        "Fitted by torchfovea calibrate; torchfovea.sensing.correspondence.Budget says what the numbers are.",
+        f"Command: torchfovea calibrate {command}",
         f"Fitted on: {', '.join(simulated + [name for name in pairs if name != 'simulated'])}",
     ]
     sizes = [cfg.sensor.source_px] if cfg.scenes else []

@@ -59,10 +59,9 @@ def run(cfg: DictConfig) -> float | None:
     refuse_unread("sensor.fov_deg", "sensor.camera", "sensor.sample")
     every = name_of(cfg, "sensor", "layout") == "every_pixel"
     retina = None if every else build_sensor(cfg)[1]  # the field of view is the images' own
-    matcher, budget = build_matcher(cfg), build_budget(cfg, pair=True)
+    matcher, pair, folder = build_matcher(cfg), load_pair(cfg), run_folder()
     printed = choice(cfg, "budget.sigma_points", ("ours", "paper")) == "paper"
-    pair, folder = load_pair(cfg), run_folder()
-    gaze_px = gaze_of(cfg, pair)
+    gaze_px, budget = gaze_of(cfg, pair), build_budget(cfg, pair=True)
 
     match = match_pair(matcher, *pair[:5], retina, gaze_px, budget)
     sensed = sense(pair, match, retina, gaze_px, SigmaPoints.paper() if printed else None, not printed)

@@ -145,8 +145,7 @@ class Budget:
     with s = `sigma_over_width`, W the RF's width, p the size of a source pixel on the retina (an RF cannot be sharper
     than its source), m the matcher's own error and b, g, f, n its `Clues` where it gives any. The odds of an outlier:
 
-        (1 − p)/p = outliers/(1 − outliers) · (1 + b)^outliers_bend · (1 + g)^outliers_gap · (1 + f)^outliers_fringe ·
-        (1 + h)^outliers_hidden · e^(outliers_mismatch c),
+        (1 − p)/p = outliers/(1 − outliers) · (1 + g)^outliers_gap · (1 + h)^outliers_hidden · e^(outliers_mismatch c),
 
     with the clues h = hidden_px and c = mismatch. The paper has the first term only: `Budget.printed`. `torchfovea
     calibrate` fits the numbers (`torchfovea.studies.fitting`).
@@ -162,9 +161,7 @@ class Budget:
         claim: factor on the standard deviation that a matcher itself claims (the sweep's curve of costs, a foreign
             matcher's confidence).
         outliers: share of outliers where no clue speaks; 0: every correspondence is certain.
-        outliers_bend: exponent of the odds.
-        outliers_gap: likewise.
-        outliers_fringe: likewise.
+        outliers_gap: exponent of the odds.
         outliers_hidden: likewise.
         outliers_mismatch: rate of the odds' growth.
         shared: share of a match's variance that neighbouring fields of one look have in common, because they see the
@@ -185,9 +182,7 @@ class Budget:
     noise: float = 0.0
     claim: float = 1.0
     outliers: float = 0.0
-    outliers_bend: float = 0.0
     outliers_gap: float = 0.0
-    outliers_fringe: float = 0.0
     outliers_hidden: float = 0.0
     outliers_mismatch: float = 0.0
     shared: float = 0.0
@@ -279,13 +274,9 @@ def inlier_share(budget: Budget, clues: Clues) -> Tensor:
 
     Differentiable.
     """
-    parts = (
-        (budget.outliers_bend, clues.bend_px), (budget.outliers_gap, clues.gap_px),
-        (budget.outliers_fringe, clues.fringe_px), (budget.outliers_hidden, clues.hidden_px),
-    )  # fmt: skip
-    odds = torch.full_like(clues.bend_px, budget.outliers / (1 - budget.outliers))
-    for power, clue in parts:
-        odds = odds if clue is None else odds * (1 + clue) ** power
+    odds = budget.outliers / (1 - budget.outliers) * (1 + clues.gap_px) ** budget.outliers_gap
+    if clues.hidden_px is not None:
+        odds = odds * (1 + clues.hidden_px) ** budget.outliers_hidden
     if clues.mismatch is not None:
         odds = odds * (budget.outliers_mismatch * clues.mismatch).exp()
     return 1 / (1 + odds)

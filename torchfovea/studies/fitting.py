@@ -26,13 +26,10 @@ __all__ = ["BudgetFit", "Likelihood", "fit_budget", "least_match_px"]
 SPREAD = {
     "sigma_over_width": 0.15, "match_px": 0.15, "bend": 0.4, "gap": 0.4, "fringe": 0.4, "noise": 0.8, "claim": 1.0,
 }  # fmt: skip
-POWERS = {
-    "outliers_bend": 0.3, "outliers_gap": 0.3, "outliers_fringe": 0.3, "outliers_hidden": 0.3, "outliers_mismatch": 0.3,
-}  # fmt: skip
+POWERS = {"outliers_gap": 0.3, "outliers_hidden": 0.3, "outliers_mismatch": 0.3}
 CLUES = {
     "bend": "bend_px", "gap": "gap_px", "fringe": "fringe_px", "noise": "noise_px", "claim": "claim_px",
-    "outliers_bend": "bend_px", "outliers_gap": "gap_px", "outliers_fringe": "fringe_px",
-    "outliers_hidden": "hidden_px", "outliers_mismatch": "mismatch",
+    "outliers_gap": "gap_px", "outliers_hidden": "hidden_px", "outliers_mismatch": "mismatch",
 }  # fmt: skip
 DRAWN = 6000  # observations of a scene, drawn by their area
 STAY = 1e-4  # pull toward the start, nats for a factor of e
@@ -171,6 +168,6 @@ def _variance(data: Judged, number: dict[str, Tensor], least_match: float) -> Te
 def _odds(data: Judged, number: dict[str, Tensor], base: Tensor) -> Tensor:
     """The logarithm of the odds of an outlier, as `correspondence.inlier_share` has it."""
     odds = base + number["outliers_mismatch"] * data.mismatch
-    for name in ("bend", "gap", "fringe", "hidden"):
+    for name in ("gap", "hidden"):
         odds = odds + number[f"outliers_{name}"] * torch.log1p(getattr(data, CLUES[f"outliers_{name}"]))
     return odds
