@@ -179,7 +179,7 @@ def perceive(
         kin = kin._replace(lasting=kin.lasting + (kin.shared - kin.lasting) * same)
     before = mind.memory
     after = remember(before, mind.lookup, mind.spacing_rad, observed, observer.fusion, observer.prior, common, kin)
-    if observer.fusion.chart == "inverse_range":
+    if observer.fusion.votes:
         missed = (after.looks == before.looks) & _in_view(observer, before, eyes)
         after = after._replace(votes=against(after.votes, missed))
     return mind._replace(memory=after, axis=axis)

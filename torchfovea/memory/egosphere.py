@@ -121,6 +121,11 @@ class Fusion:
         require(self.half_life > 0, "fusion.half_life", self.half_life, "a positive number of saccades")
 
     @property
+    def votes(self) -> bool:
+        """Whether looks vote for and against surfaces (`torchfovea.memory.voting`)."""
+        return self.chart == "inverse_range" and self.conflict < math.inf
+
+    @property
     def chart(self) -> str:
         """The chart that the memory is kept in."""
         return "inverse_range" if self.name == "inverse_range" else "cartesian"
