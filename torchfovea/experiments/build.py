@@ -80,12 +80,13 @@ def build_camera(cfg: DictConfig, radius_px: float) -> Camera:
 def build_observer(cfg: DictConfig) -> Observer:
     """The observer that a configuration describes; its strategy is `torchfovea.experiments.strategy`'s to build."""
     camera, retina = build_sensor(cfg)
+    budget = build_budget(cfg)
     printed = choice(cfg, "budget.sigma_points", ("ours", "paper")) == "paper"
     return Observer(
         head=construct(Head, cfg.head, "head"),
         camera=camera,
         retina=retina,
-        budget=build_budget(cfg),
+        budget=budget,
         points=SigmaPoints.paper() if printed else None,
         rotated=not printed,
         fusion=construct(Fusion, cfg.fusion, "fusion"),

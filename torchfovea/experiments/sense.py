@@ -60,8 +60,8 @@ def run(cfg: DictConfig) -> float | None:
     every = name_of(cfg, "sensor", "layout") == "every_pixel"
     retina = None if every else build_sensor(cfg)[1]  # the field of view is the images' own
     matcher, pair, folder = build_matcher(cfg), load_pair(cfg), run_folder()
-    printed = choice(cfg, "budget.sigma_points", ("ours", "paper")) == "paper"
     gaze_px, budget = gaze_of(cfg, pair), build_budget(cfg, pair=True)
+    printed = choice(cfg, "budget.sigma_points", ("ours", "paper")) == "paper"
 
     match = match_pair(matcher, *pair[:5], retina, gaze_px, budget)
     sensed = sense(pair, match, retina, gaze_px, SigmaPoints.paper() if printed else None, not printed)
