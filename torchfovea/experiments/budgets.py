@@ -46,8 +46,13 @@ def build_budget(cfg: DictConfig, pair: bool = False) -> Budget:
 
 
 def shipped(cfg: DictConfig) -> Path | None:
-    """The budget that comes along for a configuration's layout and matcher; None where there is none."""
-    path = Path(conf_dir()) / "budget" / f"{cfg.sensor.layout}_{cfg.matcher.name}.yaml"
+    """The budget that comes along for a configuration's layout and matcher; None where there is none.
+
+    Rendered pictures have one of their own, ``LAYOUT_MATCHER_rendered.yaml``: they are free of noise, and their eyes
+    are alike.
+    """
+    rendered = "_rendered" if OmegaConf.select(cfg, "fidelity") is not None else ""
+    path = Path(conf_dir()) / "budget" / f"{cfg.sensor.layout}_{cfg.matcher.name}{rendered}.yaml"
     return path if path.is_file() else None
 
 

@@ -36,7 +36,7 @@ __all__ = ["random_gazes", "run"]
 QUICK = {"scenes": 2, "judged_scenes": 2, "looks": 2}
 FULL = {"scenes": 16, "judged_scenes": 16, "looks": 2}
 JUDGED_SEEDS = 1000  # scenes to judge on have seeds from here, so that none is fitted on
-SHARPEST_PX = 0.01  # a fitted σ below this in a field of one source pixel has collapsed
+SHARPEST_PX = 0.01  # a fit whose median σ of a disparity is below this has collapsed
 
 
 class Split(NamedTuple):
@@ -202,8 +202,11 @@ def _sharing(budget: Budget, data: dict[str, Split]) -> Budget:
     shared = shared_share([look.data for split in data.values() for look in split.looks], budget)
     sights = [[Sight(t.data, t.point_m, t.axis) for t in looks] for split in data.values() for looks in split.scenes]
     lasting = lasting_share(sights, budget)
-    shared = budget.shared if shared is None else shared
-    return replace(budget, shared=shared, lasting=min(budget.lasting if lasting is None else lasting, shared))
+    if shared is not None:
+        share, factor = shared
+        px, widths = (factor * length for length in (budget.shared_px, budget.shared_widths))
+        budget = replace(budget, shared=share, shared_px=px, shared_widths=widths, lasting=min(budget.lasting, share))
+    return budget if lasting is None else replace(budget, lasting=min(lasting, budget.shared))
 
 
 def _refuse(figures: dict[str, Any], data: dict[str, Split], models: dict[str, dict[str, Budget]], law: Budget) -> None:
@@ -214,8 +217,10 @@ def _refuse(figures: dict[str, Any], data: dict[str, Split], models: dict[str, d
         then, now = (figures[f"{prefix}{m}.mixture_nll_by_area"] for m in ("before", model))
         good = now <= then
         require(good, f"fit: {kind}, {model}, mixture_nll_by_area", f"{now:.3f}", f"at most {then:.3f}, as before")
-    sharpest = math.hypot(math.sqrt(2) * law.sigma_over_width, law.match_px)
-    require(sharpest > SHARPEST_PX, "fit: σ", f"{sharpest:.2g} px", f"more than {SHARPEST_PX} source pixels")
+    for split in data.values():
+        sharp = sigma_of(split.fitted, law) / (split.fitted.right_gain * split.fitted.pixel_px)
+        median = float(sharp.median())
+        require(median > SHARPEST_PX, "fit: median σ", f"{median:.2g} px", f"more than {SHARPEST_PX} source pixels")
 
 
 def _write(path: Path, law: Budget, cfg: DictConfig, data: dict[str, Split], angles: list[float]) -> None:

@@ -24,6 +24,7 @@ SAME_RANGE = 0.03  # relative difference of two places on one surface
 ASKED = 1500  # fields of a look whose neighbours are asked
 LEAST_PAIRS = 100  # fewer tell nothing
 LENGTHS = 3.0  # correlation lengths within which fields are neighbours
+FACTORS = (0.2, 0.3, 0.45, 0.7, 1.0, 1.5)  # of the budget's correlation lengths, to choose from
 GAZES_DEG = (5.0, 40.0)  # looks nearer to each other are one look, farther ones have little in common
 
 
@@ -41,20 +42,22 @@ class Sight(NamedTuple):
     axis: Tensor
 
 
-def shared_share(looks: Sequence[Judged], budget: Budget) -> float | None:
-    """The share of the variance that neighbouring fields have in common (`Budget.shared`).
+def shared_share(looks: Sequence[Judged], budget: Budget) -> tuple[float, float] | None:
+    """How much of the variance neighbouring fields have in common, and how far (`Budget.shared`, `shared_px`).
 
-    Over pairs of fields on one smooth surface, the regression of z z′/⟨(z² + z′²)/2⟩ on e^(−d/L), d their distance.
+    Over pairs of fields on one smooth surface, the regression of z z′/⟨(z² + z′²)/2⟩ on e^(−d/(k L)), d their distance
+    and L the budget's length, by the one of some factors k that explains most.
 
     Args:
         looks: observations of one look each.
         budget: whose σ they are measured in, and whose `shared_px` and `shared_widths` make L.
 
     Returns:
-        In [0, 1); None where there are too few neighbours.
+        The share, in [0, 1), and k; None where there are too few neighbours.
     """
-    product, kernel, pairs = 0.0, 0.0, 0
-    power, total = 0.0, 0.0
+    product, kernel = torch.zeros(2, len(FACTORS), dtype=torch.float64)
+    power, total, pairs = 0.0, 0.0, 0
+    factors = torch.tensor(FACTORS, dtype=torch.float64)[:, None]
     for data in looks:
         z, smooth = _cut(data, budget), data.region == 0
         z, place, rho = z[smooth], data.place_px[smooth].double(), 1 / data.range_m[smooth]
@@ -68,16 +71,21 @@ def shared_share(looks: Sequence[Judged], budget: Budget) -> float | None:
         length = torch.clamp(budget.shared_widths * width[some], min=budget.shared_px)[:, None]
         away = torch.cdist(place[some], place)
         near = (away > 0) & (away < LENGTHS * length) & ((rho / rho[some, None] - 1).abs() < SAME_RANGE)
-        weight = torch.where(near, torch.exp(-away / length), torch.zeros_like(away))
+        one, other = near.nonzero(as_tuple=True)
         # neighbours of a field count as one
-        share = weight / near.sum(1, keepdim=True).clamp(min=1)
-        product += float((share * z[some, None] * z).sum())
-        kernel += float((share * weight).sum())
-        even = near / near.sum(1, keepdim=True).clamp(min=1)
-        power += float((even * (z[some, None].square() + z.square()) / 2).sum())
+        even = 1 / near.sum(1)[one].double()
+        first, second = z[some][one], z[other]
+        falls = torch.exp(-(away / length)[one, other] / factors)
+        product += (falls * (even * first * second)).sum(1)
+        kernel += (falls.square() * even).sum(1)
+        power += float((even * (first.square() + second.square()) / 2).sum())
         total += float(even.sum())
-        pairs += int(near.sum())
-    return None if pairs < LEAST_PAIRS else min(max(product / kernel / (power / total), 0.0), 0.99)
+        pairs += len(one)
+    if pairs < LEAST_PAIRS:
+        return None
+    best = int((product.clamp(min=0).square() / kernel).argmax())
+    share = float(product[best] / kernel[best]) / (power / total)
+    return min(max(share, 0.0), 0.99), FACTORS[best]
 
 
 def lasting_share(scenes: Sequence[Sequence[Sight]], budget: Budget) -> float | None:
