@@ -143,19 +143,25 @@ def test_a_surface_that_is_gone_fades_with_looks_that_miss_it():
 
 
 @pytest.mark.parametrize(("fields", "patches"), [(1, 0.1), (12, 0.5), (40, 3.0)])
-def test_what_fields_share_does_not_average_out(fields, patches):
+@pytest.mark.parametrize("alike", [True, False])
+def test_what_fields_share_does_not_average_out(fields, patches, alike):
     rng, shared, runs = torch.Generator().manual_seed(0), 0.6, 40_000
     correlation = shared / (1 + patches)
     common = torch.randn(runs, 1, generator=rng, dtype=torch.float64)
     own = torch.randn(runs, fields, generator=rng, dtype=torch.float64)
-    error = correlation**0.5 * common + (1 - correlation) ** 0.5 * own
     ones = torch.ones(fields, dtype=torch.float64)
-    row = columns(0 * ones, 0 * ones, ones)
-    pooled = pool_patches(ones, 0.04 * ones, ones, row, ones, torch.zeros(fields, dtype=torch.int64), ONE, 1)
-    told, share = share_errors(pooled, torch.tensor([patches], dtype=torch.float64), shared, 0.3)
+    variance = 0.04 * (ones if alike else torch.linspace(0.2, 5, fields, dtype=torch.float64))
+    error = (correlation**0.5 * common + (1 - correlation) ** 0.5 * own) * variance.sqrt()
+    row, cell = columns(0 * ones, 0 * ones, ones), torch.zeros(fields, dtype=torch.int64)
+    pooled = pool_patches(ones, variance, ones, row, ones, cell, ONE, 1)
+    precision = columns((1 / variance).sum(), variance.rsqrt().sum())[None]
+    told, lasting = share_errors(pooled, precision, torch.tensor([patches], dtype=torch.float64), shared, 0.3)
     claimed = 1 / told.information.matrix[0, 5].item()
-    assert 0.04 * error.mean(1).var().item() == pytest.approx(claimed, rel=0.03)
-    assert share.item() * claimed == pytest.approx(0.04 * 0.3 / (1 + patches))
+    mean = (error / variance).sum(1) / (1 / variance).sum()
+    assert mean.var().item() == pytest.approx(claimed, rel=0.03)
+    # what is common is in the proportion of the standard deviations, and of it the part that lasts
+    lasts = 0.3 / (1 + patches) * (precision[0, 1] / precision[0, 0]) ** 2
+    assert lasting.item() == pytest.approx(lasts.item())
 
 
 def test_what_lasts_between_looks_stays():

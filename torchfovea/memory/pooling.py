@@ -83,14 +83,18 @@ def pool_patches(
     return _sum_up([*parts, keep], cell, batch, cells)
 
 
-def share_errors(pooled: Pooled, patches: Tensor, shared: float, lasting: Tensor | float) -> tuple[Pooled, Tensor]:
+def share_errors(
+    pooled: Pooled, precision: Tensor, patches: Tensor, shared: float, lasting: Tensor | float
+) -> tuple[Pooled, Tensor]:
     """Count what a look's fields have in common: their errors do not average out as if each erred by itself.
 
-    Over a cell that D patches of common error cover, the mean correlation of its n fields is r/(1 + D), r the share of
-    their variance v that they have in common; the mean of theirs has the variance v (1 − r/(1 + D))/n + v r/(1 + D).
+    Fields of variances v, weighted by 1/v, share c = r/(1 + D) of each variance over a cell that D patches of common
+    error cover. With Λ = Σ 1/v and s = Σ 1/√v the variance of their mean is (1 − c)/Λ + c s²/Λ²: what is their own
+    averages out, what they share stays, and tells slopes from nothing, for it is the same all over the cell.
 
     Args:
         pooled: from `pool_patches`.
+        precision: Λ and s, (..., Nx, 2).
         patches: D, (..., Nx).
         shared: r.
         lasting: the share of v that looks at the same surface have in common, at most r; broadcastable to (..., Nx).
@@ -99,12 +103,30 @@ def share_errors(pooled: Pooled, patches: Tensor, shared: float, lasting: Tensor
         The pooled observations with their true information, and the variance of inverse range that lasts (..., Nx).
         Differentiable.
     """
-    fields, spread = pooled.hits.clamp(min=1), 1 / (1 + patches)
-    common = shared * spread
-    factor = 1 / (1 + (fields - 1) * common)
-    information = Information(*(factor[..., None] * part for part in pooled.information))
-    pooled = Pooled(information, factor * pooled.bearing, pooled.hits)
-    return pooled, lasting * spread / ((1 - common) / fields + common)
+    total, root = precision.unbind(-1)
+    seen = total > 0
+    spread = 1 / (1 + patches)
+    share = shared * spread
+    square = torch.where(seen, root / torch.where(seen, total, 1.0), 0.0).square()
+    own = 1 / (1 - share)
+    information = Information(*(own[..., None] * part for part in pooled.information))
+    information = _with_common(information, share * square)
+    return Pooled(information, pooled.bearing, pooled.hits), lasting * spread * square
+
+
+def _with_common(information: Information, variance: Tensor) -> Information:
+    """Information of patches whose inverse range has an error in common besides, of a variance (...).
+
+    (Λ⁻¹ + v e eᵀ)⁻¹ = Λ − v Λe (Λe)ᵀ/(1 + v eᵀΛe), e the axis of ρ: good for a singular Λ too.
+    """
+    vector, matrix = information
+    xz, yz, zz = matrix[..., 2], matrix[..., 4], matrix[..., 5]
+    scale = variance / (1 + variance * zz)
+    outer = columns(xz * xz, xz * yz, xz * zz, yz * yz, yz * zz, zz * zz)
+    less = scale * vector[..., 2]
+    return Information(
+        vector - columns(less * xz, less * yz, less * zz), matrix - columns(*(scale * o for o in outer.unbind(-1)))
+    )
 
 
 def add_common(pooled: Pooled, common: Tensor, chart: str, slope_std: float = 0.0) -> Pooled:
@@ -127,15 +149,7 @@ def add_common(pooled: Pooled, common: Tensor, chart: str, slope_std: float = 0.
         matrix = torch.where(seen, inverse3(cov + common), matrix)
         return pooled._replace(information=Information(torch.where(seen, times3(matrix, mean), vector), matrix))
     aa, _, _, bb, _, rr = common.unbind(-1)
-    variance = rr + slope_std**2 * (aa + bb)
-    # (Λ⁻¹ + v e eᵀ)⁻¹ = Λ − v Λe (Λe)ᵀ/(1 + v eᵀΛe), e the axis of ρ: good for a singular Λ too
-    xz, yz, zz = matrix[..., 2], matrix[..., 4], matrix[..., 5]
-    scale = variance / (1 + variance * zz)
-    outer = columns(xz * xz, xz * yz, xz * zz, yz * yz, yz * zz, zz * zz)
-    less = scale * vector[..., 2]
-    information = Information(
-        vector - columns(less * xz, less * yz, less * zz), matrix - columns(*(scale * o for o in outer.unbind(-1)))
-    )
+    information = _with_common(pooled.information, rr + slope_std**2 * (aa + bb))
     bearing = pooled.bearing / (1 + pooled.bearing * (aa + bb) / 2)
     return pooled._replace(information=information, bearing=bearing)
 

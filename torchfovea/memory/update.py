@@ -131,10 +131,11 @@ def _remember_patches(
     pooled = pool_patches(sight.rho, sight.variance, sight.bearing, sight.row, ballot.keep, sight.cell, batch, count)
     lasting = None
     if kin is not None:
-        patch = ballot.keep * kin.patch.to(ballot.keep).reshape(-1).index_select(0, pairs.observation)
-        patches = torch.zeros_like(pooled.hits).reshape(-1).index_add(0, sight.cell, patch).reshape(pooled.hits.shape)
-        pooled, share = share_errors(pooled, patches, kin.shared, kin.lasting)
-        lasting = share * _variance(pooled, prior)
+        patch = kin.patch.to(ballot.keep).reshape(-1).index_select(0, pairs.observation)
+        parts = torch.stack([1 / sight.variance, sight.variance.rsqrt(), patch]) * ballot.keep
+        sums = parts.new_zeros(3, batch.numel() * count).scatter_add(1, sight.cell.expand(3, -1), parts)
+        total, root, patches = sums.reshape(3, *batch, count)
+        pooled, lasting = share_errors(pooled, columns(total, root), patches, kin.shared, kin.lasting)
     pooled = _add(pooled, cells, "inverse_range", prior, common)
     if lasting is not None:
         weight = torch.where(pooled.hits > 0, 1 / _variance(pooled, prior), 0.0)

@@ -19,11 +19,12 @@ from torchfovea.studies.calibration import Judged, sigma_of
 
 __all__ = ["Sight", "lasting_share", "shared_share"]
 
-CUT = 3.0  # larger |z| count as this
+CUT = 5.0  # larger |z| count as this, as in `torchfovea.metrics.nees_mean`
+GROSS = 3.0  # and beyond this an error tells nothing of what neighbours share: votes and inlier probabilities see to it
 SAME_RANGE = 0.03  # relative difference of two places on one surface
 ASKED = 1500  # fields of a look whose neighbours are asked
 LEAST_PAIRS = 100  # fewer tell nothing
-LENGTHS = 3.0  # correlation lengths within which fields are neighbours
+LENGTHS = 1.0  # correlation lengths of the budget within which fields are neighbours
 FACTORS = (0.2, 0.3, 0.45, 0.7, 1.0, 1.5)  # of the budget's correlation lengths, to choose from
 GAZES_DEG = (5.0, 40.0)  # looks nearer to each other are one look, farther ones have little in common
 
@@ -59,7 +60,8 @@ def shared_share(looks: Sequence[Judged], budget: Budget) -> tuple[float, float]
     power, total, pairs = 0.0, 0.0, 0
     factors = torch.tensor(FACTORS, dtype=torch.float64)[:, None]
     for data in looks:
-        z, smooth = _cut(data, budget), data.region == 0
+        z = (data.error / sigma_of(data, budget)).double()
+        smooth = (data.region == 0) & (z.abs() <= GROSS)
         z, place, rho = z[smooth], data.place_px[smooth].double(), 1 / data.range_m[smooth]
         width = (data.left_width_px / data.pixel_px)[smooth]
         area = data.area()[smooth].double()
