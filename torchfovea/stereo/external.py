@@ -29,9 +29,9 @@ from torchfovea.stereo.rectification import frame_to_show, image_frame
 from torchfovea.stereo.views import Views, grey_of
 from torchfovea.stereo.visibility import undisputed
 
-__all__ = ["External", "Matcher", "load_matcher", "match_external"]
+__all__ = ["DisparityFunction", "External", "load_matcher", "match_external"]
 
-Matcher = Callable[[np.ndarray, np.ndarray], Any]
+DisparityFunction = Callable[[np.ndarray, np.ndarray], Any]
 """From the left and right images, float32 (H, W, 3) in [0, 1], to disparity (H, W) [px] or (disparity, confidence)."""
 
 
@@ -78,17 +78,17 @@ class External:
         return self.sure_px + (self.unsure_px - self.sure_px) * (1 - confidence.clamp(0, 1)) ** self.power
 
 
-def load_matcher(source: str, setting: str = "matcher.source") -> Matcher:
+def load_matcher(source: str, setting: str = "matcher.source") -> DisparityFunction:
     """A function by its name, ``package.module:function``.
 
     Raises:
         SettingError: for another form, a module that does not import, or a name that is no function.
     """
-    found: Matcher = load_function(source, setting, "an existing file or package.module:function")
+    found: DisparityFunction = load_function(source, setting, "an existing file or package.module:function")
     return found
 
 
-def _ask(matcher: Matcher, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor | None]:
+def _ask(matcher: DisparityFunction, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor | None]:
     """Call a user's function on images (3, H, W)."""
     name = getattr(matcher, "__name__", type(matcher).__name__)
     views = [np.ascontiguousarray(view.detach().cpu().float().movedim(0, -1).numpy()) for view in (left, right)]
@@ -101,7 +101,7 @@ def _ask(matcher: Matcher, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor 
 
 
 def match_external(
-    source: str | Path | Matcher,
+    source: str | Path | DisparityFunction,
     views: Views,
     retina: Retina | None = None,
     params: External | None = None,
@@ -157,7 +157,7 @@ def match_external(
     return _doubt(matches, confidence, place, scale, params, budget.claim), found
 
 
-def _answer(source: str | Path | Matcher, shown: Tensor, files: bool) -> tuple[Tensor, Tensor | None]:
+def _answer(source: str | Path | DisparityFunction, shown: Tensor, files: bool) -> tuple[Tensor, Tensor | None]:
     """The disparity and the confidence (H, W) of views (2, 3, H, W), from a file where it may be one, or a function."""
     if isinstance(source, str | Path) and (isinstance(source, Path) or ":" not in source or Path(source).exists()):
         require(
