@@ -25,10 +25,11 @@ from torchfovea.sensing.layout import LogPolar, Retina, Uniform
 from torchfovea.sim.cans import Cans
 from torchfovea.sim.scene import build_scene
 from torchfovea.sim.world import World
+from torchfovea.stereo.maps import match_disparity
 from torchfovea.stereo.matching import match_sgbm
-from torchfovea.stereo.rectified import match_disparity, match_rectified
 from torchfovea.stereo.rig import verged
-from torchfovea.stereo.sweep import match_sweep, match_sweep_rectified
+from torchfovea.stereo.sweep import match_sweep
+from torchfovea.stereo.views import Views, verged_views
 
 FOVEA_PX = 20.0
 RETINAS = {"log_polar": LogPolar(), "uniform": Uniform()}
@@ -70,35 +71,37 @@ def timed(match: Any) -> tuple[Any, float]:
     return match(), time.perf_counter() - start
 
 
+def matched(views: Views, retina: Retina, nearest_m: float) -> dict[str, tuple[Correspondences, float]]:
+    """What both matchers find, and the seconds they take."""
+    found = {}
+    for name, match in (("sgbm", match_sgbm), ("sweep", match_sweep)):
+        answer, seconds = timed(lambda match=match: match(views, retina, nearest_range_m=nearest_m))
+        found[name] = (answer[0], seconds)
+    return found
+
+
 def compare_cans(seed: int, retina: Retina, fov_deg: float, source_px: int) -> list[list[Any]]:
     """One scene of cans."""
     scene = build_scene(Cans(), seed)
     camera = Pinhole.from_fov(fov_deg, retina.radius_px)
     world = World(scene, camera=camera, source_px=source_px, radius_px=retina.radius_px)
     gaze = world.saccade(fixate(scene.head, scene.nearest_point_e)[0]).gaze
-    images = [frame.image for frame in world.images()]
+    left, right = (frame.image for frame in world.images())
     rig, pose = verged(gaze.vergence, scene.head.baseline_m), eyes(scene.head, gaze)
     truth = world.correspond(gaze, camera.rays(retina.centers_px(dtype=torch.float64)))
     line = (truth.points_e - pose.t_right) @ pose.R_right
     right_px = camera.project(line)
     seen = truth.visible_right & camera.in_view(line) & retina.inside(right_px)
-    found = {}
-    for name, match in (("sgbm", match_sgbm), ("sweep", match_sweep)):
-        answer, seconds = timed(lambda match=match: match(*images, rig, camera, retina))
-        found[name] = (answer[0], seconds)
+    found = matched(verged_views(left, right, rig, camera, retina.radius_px), retina, 0.3)
     return judge(found, right_px, seen, retina, source_px)
 
 
 def compare_motorcycle(retina: Retina) -> list[list[Any]]:
     """The motorcycle pair, looked at in its middle."""
     pair = motorcycle()
-    options = {"retina": retina, "nearest_range_m": 1.0}
-    cameras = pair.camera_left, pair.camera_right, pair.baseline_m
-    truth = match_disparity(pair.disparity, *cameras, **options).correspondences
-    found = {}
-    for name, match in (("sgbm", match_rectified), ("sweep", match_sweep_rectified)):
-        answer, seconds = timed(lambda match=match: match(pair.left, pair.right, *cameras, **options))
-        found[name] = (answer.correspondences, seconds)
+    views = pair.views(None)
+    truth, _ = match_disparity(pair.disparity, views, retina, nearest_range_m=1.0)
+    found = matched(views, retina, 1.0)
     return judge(found, truth.right_px.double(), truth.valid, retina, min(pair.left.shape[-2:]))
 
 

@@ -26,8 +26,8 @@ from torchfovea.sensing.layout import LogPolar, Uniform
 from torchfovea.sensing.triangulation import observe
 from torchfovea.setting import SettingError
 from torchfovea.stereo.confidence import BLOCK_PX, read_clues
-from torchfovea.stereo.matching import correspondences
-from torchfovea.stereo.rectified import match_disparity
+from torchfovea.stereo.maps import correspondences, match_disparity
+from torchfovea.stereo.views import rectified_views
 from torchfovea.studies.calibration import (
     concatenate,
     inlier_of,
@@ -332,21 +332,20 @@ def test_matches_carry_the_same_sigma_as_the_fit_assumes():
     disparity = np.where(np.arange(160) > 90, 14.0, 9.0) + 0.1 * rng.normal(size=(120, 160))
     valid = rng.random((120, 160)) < 0.95
     budget, retina = Budget(0.12, 400, 0.1, bend=0.6, gap=0.3), Uniform(2000)
-    left, right = Pinhole(150.0, 79.5, 59.5), Pinhole(150.0, 79.5, 59.5)
-    match = match_disparity(disparity, left, right, 0.1, retina, valid=valid, budget=budget)
-    found, scale = match.correspondences, 120 / 200
+    camera, black = Pinhole(150.0, 79.5, 59.5), torch.zeros(1, 120, 160)
+    views = rectified_views(black, black, camera, camera, 0.1)
+    found, field = match_disparity(disparity, views, retina, budget, valid=valid)
+    scale, (left, right) = 120 / 200, views.cameras(retina)
     place = found.left_px * scale + torch.tensor([79.5, 59.5])
     shift, width = (found.left_px - found.right_px)[:, 0] * scale, retina.width_px(found.left_px) * scale
-    clues = read_clues(match.disparity, place, shift, width)
+    clues = read_clues(field, place, shift, width)
     own = replace(budget, source_px=120)
     same = torch.eye(3)
     from torchfovea.sensing.head import Eyes
 
     pose = Eyes(same, torch.zeros(3), same, torch.tensor([0.1, 0.0, 0.0]))
-    data, which = judged(
-        found, pose, match.camera_left, retina, own, torch.ones(retina.count), clues, match.camera_right
-    )
-    seen = observe(found, pose, match.camera_left, width, right_camera=match.camera_right)
+    data, which = judged(found, pose, left, retina, own, torch.ones(retina.count), clues, right)
+    seen = observe(found, pose, left, width, right_camera=right)
     assert data.bend_px.max() > 2 and data.gap_px.max() > 0 and data.claim_px.max() == 0
     ratio = sigma_of(data, own).double() / seen.cov[which, 5].sqrt().double()
     assert ratio.median().item() == pytest.approx(1, abs=2e-3) and (ratio - 1).abs().quantile(0.9) < 0.05

@@ -82,6 +82,20 @@ def test_a_part_by_its_function_alone(mine, capsys):
     assert main(["search", *sources, *small, "hydra.run.dir=run"]) == 0, capsys.readouterr().err
 
 
+def test_a_users_own_matcher_senses_a_rectified_pair_too(mine, capsys):
+    """A real pair, 2 to 5 m away, by the same few lines."""
+    pytest.importorskip("skimage.data")
+    arguments = [one for one in written("A matcher", mine) if one != "search"]
+    more = "pair=motorcycle", "matcher.nearest_m=1.5", "matcher.ranges=64"
+    small = "sensor.receptive_fields=3000"
+    assert main(["sense", *arguments, *more, small, "hydra.run.dir=run"]) == 0, capsys.readouterr().err
+    result = json.loads((mine / "run" / "result.json").read_text())
+    assert result["valid_fraction"] > 0.5 and result["median_error_m"] < 0.3
+    assert (mine / "run" / "sense.png").exists()
+    assert main(["sense", *arguments, *more, "sensor=every_pixel", "hydra.run.dir=none"]) == 1
+    assert "sensor.layout = every_pixel" in capsys.readouterr().err
+
+
 def test_workers_have_a_users_own_parts_too(mine, capsys):
     arguments = written("A renderer", mine)
     assert main([*arguments, *TINY, "episodes=2", "workers=2", "hydra.run.dir=run"]) == 0, capsys.readouterr().err

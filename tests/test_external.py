@@ -8,9 +8,10 @@ from torchfovea.sensing.camera import Fisheye, Pinhole
 from torchfovea.sensing.layout import LogPolar, Uniform
 from torchfovea.setting import SettingError
 from torchfovea.stereo.disparity_files import load_disparity
-from torchfovea.stereo.external import External, load_matcher, match_external, match_external_rectified
-from torchfovea.stereo.rectified import match_disparity
+from torchfovea.stereo.external import External, load_matcher, match_external
+from torchfovea.stereo.maps import match_disparity
 from torchfovea.stereo.rig import verged
+from torchfovea.stereo.views import rectified_views, verged_views
 
 CAMERAS = Pinhole(120.0, 50.0, 38.0), Pinhole(120.0, 55.0, 38.0)
 SIZE = (80, 100)
@@ -27,6 +28,11 @@ def disparity():
 @pytest.fixture
 def images(generator):
     return torch.rand(3, *SIZE, generator=generator), torch.rand(3, *SIZE, generator=generator)
+
+
+@pytest.fixture
+def views(images):
+    return rectified_views(*images, *CAMERAS, 0.2)
 
 
 def write_pfm(path, values, little=True):
@@ -65,28 +71,25 @@ def test_pfm_as_opencv_writes_it(tmp_path, disparity):
     np.testing.assert_array_equal(load_disparity(tmp_path / "d.pfm")[0].numpy(), np.nan_to_num(disparity))
 
 
-def test_a_file_gives_what_its_disparity_gives(tmp_path, disparity, images):
+def test_a_file_gives_what_its_disparity_gives(tmp_path, disparity, images, views):
     np.savez(tmp_path / "d.npz", disparity=disparity, confidence=np.ones(SIZE))
     retina = LogPolar(800)
-    match = match_external_rectified(tmp_path / "d.npz", *images, *CAMERAS, 0.2, retina, nearest_range_m=0.5)
-    expected = match_disparity(disparity, *CAMERAS, 0.2, retina, nearest_range_m=0.5)
-    for a, b in zip(match.correspondences, expected.correspondences, strict=True):
+    found, field = match_external(tmp_path / "d.npz", views, retina, nearest_range_m=0.5)
+    expected = match_disparity(disparity, views, retina, nearest_range_m=0.5)[0]
+    for a, b in zip(found, expected, strict=True):
         torch.testing.assert_close(a, b)
-    again = match_external_rectified(str(tmp_path / "d.npz"), *images, *CAMERAS, 0.2, retina, nearest_range_m=0.5)
-    assert torch.equal(again.correspondences.right_px, match.correspondences.right_px)
-    torch.testing.assert_close(match.disparity.image, images[0].mean(0))
-    every = match_external_rectified(tmp_path / "d.npz", *images, *CAMERAS, 0.2, nearest_range_m=0.5)
-    assert every.correspondences.valid.sum() > 0.7 * SIZE[0] * SIZE[1]
+    again, _ = match_external(str(tmp_path / "d.npz"), views, retina, nearest_range_m=0.5)
+    assert torch.equal(again.right_px, found.right_px)
+    torch.testing.assert_close(field.image, images[0].mean(0))
+    every, _ = match_external(tmp_path / "d.npz", views, nearest_range_m=0.5)
+    assert every.valid.sum() > 0.7 * SIZE[0] * SIZE[1]
 
 
-def test_confidence_is_a_standard_deviation(disparity, images):
+def test_confidence_is_a_standard_deviation(disparity, views):
     confidence = np.tile(np.linspace(0, 1, SIZE[1], dtype=np.float32), (SIZE[0], 1))
     params = External(sure_px=0.2, unsure_px=2.0, power=2.0, least_confidence=0.25)
-    match = match_external_rectified(
-        lambda left, right: (disparity, confidence), *images, *CAMERAS, 0.2, params=params, nearest_range_m=0.5
-    )
-    plain = match_disparity(disparity, *CAMERAS, 0.2, nearest_range_m=0.5).correspondences
-    found = match.correspondences
+    found, _ = match_external(lambda left, right: (disparity, confidence), views, params=params, nearest_range_m=0.5)
+    plain, _ = match_disparity(disparity, views, nearest_range_m=0.5)
     c = torch.from_numpy(confidence).flatten()
     assert torch.equal(found.valid, plain.valid & (c >= 0.25))
     expected = torch.hypot(plain.right_sigma_px, 0.2 + 1.8 * (1 - c) ** 2)
@@ -95,9 +98,7 @@ def test_confidence_is_a_standard_deviation(disparity, images):
     # on a retina the same standard deviation, in its own pixels
     retina = Uniform(2000)
     foveal, without = (
-        match_external_rectified(
-            lambda left, right, c=c: (disparity, c), *images, *CAMERAS, 0.2, retina, params=params, nearest_range_m=0.5
-        ).correspondences
+        match_external(lambda left, right, c=c: (disparity, c), views, retina, params, nearest_range_m=0.5)[0]
         for c in (np.full(SIZE, 0.5, np.float32), np.ones(SIZE, np.float32))
     )
     extra = foveal.right_sigma_px.square() - without.right_sigma_px.square()
@@ -105,20 +106,20 @@ def test_confidence_is_a_standard_deviation(disparity, images):
     torch.testing.assert_close(extra, torch.full_like(extra, (0.65**2 - 0.2**2) / scale**2), rtol=1e-3, atol=1e-4)
 
 
-def test_a_function_sees_both_images(disparity, images):
+def test_a_function_sees_both_images(disparity, images, views):
     seen = []
 
     def matcher(left, right):
         seen.extend([left, right])
         return torch.from_numpy(disparity)
 
-    match_external_rectified(matcher, *images, *CAMERAS, 0.2, nearest_range_m=0.5)
+    match_external(matcher, views, nearest_range_m=0.5)
     for view, image in zip(seen, images, strict=True):
         assert view.dtype == np.float32 and view.shape == (*SIZE, 3)
         np.testing.assert_array_equal(view, image.movedim(0, -1).numpy())
 
 
-def test_a_function_by_its_name(images):
+def test_a_function_by_its_name(views):
     assert load_matcher("numpy:zeros") is np.zeros
     with pytest.raises(SettingError, match=r"matcher\.source = numpy:nothing"):
         load_matcher("numpy:nothing")
@@ -127,7 +128,7 @@ def test_a_function_by_its_name(images):
     with pytest.raises(SettingError, match=r"package\.module:function"):
         load_matcher("numpy")
     with pytest.raises(SettingError, match=r"disparity\.shape"):  # numpy.minimum(left, right) has three axes
-        match_external_rectified("numpy:minimum", *images, *CAMERAS, 0.2)
+        match_external("numpy:minimum", views)
 
 
 @pytest.mark.parametrize("camera", [Pinhole.from_fov(90.0, 100.0), Fisheye.from_fov(120.0, 100.0)], ids=["pin", "fish"])
@@ -143,7 +144,7 @@ def test_verged_eyes_see_rectified_views(camera, retina, generator):
         views.append((left, right))
         return np.full(left.shape[:2], size_focal * 0.2 / depth)
 
-    matches, field = match_external(matcher, *images, rig, camera, retina)
+    matches, field = match_external(matcher, verged_views(*images, rig, camera, retina.radius_px), retina)
     assert views[0][0].shape == views[0][1].shape == (*field.disparity.shape, 3)
     rays = camera.rays(matches.left_px) @ rig.R_left.T
     point = rays / rays[:, 2:] * depth - torch.tensor([0.2, 0, 0], dtype=torch.float64)
@@ -155,14 +156,14 @@ def test_verged_eyes_see_rectified_views(camera, retina, generator):
     assert all(t.isfinite().all() for t in matches[:4])
 
 
-def test_nothing_found_is_well_formed(images):
+def test_nothing_found_is_well_formed(views):
     nothing = np.full(SIZE, np.nan)
-    match = match_external_rectified(lambda left, right: nothing, *images, *CAMERAS, 0.2, LogPolar(800))
-    assert not match.correspondences.valid.any()
-    assert all(t.isfinite().all() for t in match.correspondences[:4])
+    found, _ = match_external(lambda left, right: nothing, views, LogPolar(800))
+    assert not found.valid.any()
+    assert all(t.isfinite().all() for t in found[:4])
 
 
-def test_bad_files_are_named(tmp_path, disparity, images):
+def test_bad_files_are_named(tmp_path, disparity, views):
     bad = {
         "three.npy": lambda p: np.save(p, np.zeros((2, 3, 4))),
         "words.npy": lambda p: np.save(p, np.array([["a", "b"]])),
@@ -185,10 +186,10 @@ def test_bad_files_are_named(tmp_path, disparity, images):
         load_disparity(tmp_path / "missing.npy")
     np.save(tmp_path / "small.npy", disparity[:20])
     with pytest.raises(SettingError, match=r"disparity\.shape"):
-        match_external_rectified(tmp_path / "small.npy", *images, *CAMERAS, 0.2)
+        match_external(tmp_path / "small.npy", views)
 
 
-def test_bad_answers_and_settings_are_named(disparity, images):
+def test_bad_answers_and_settings_are_named(tmp_path, disparity, images, views):
     left, right = images
 
     def answer(value):
@@ -202,16 +203,15 @@ def test_bad_answers_and_settings_are_named(disparity, images):
     ]
     for matcher, message in cases:
         with pytest.raises(SettingError, match=message):
-            match_external_rectified(matcher, left, right, *CAMERAS, 0.2)
-    rig, camera = verged(0.1, 0.2), Pinhole.from_fov(90.0, 100.0)
-    with pytest.raises(SettingError, match=r"right\.shape"):
-        match_external(answer(disparity), left, right[:, :10], rig, camera, LogPolar(800))
-    with pytest.raises(SettingError, match="left = NaN"):
-        match_external(answer(disparity), left * torch.nan, right, rig, camera, LogPolar(800))
-    with pytest.raises(SettingError, match=r"disparity\.shape"):
-        match_external(answer(disparity), left, right, rig, camera, LogPolar(800))
-    with pytest.raises(SettingError, match="a function"):
-        match_external(3, left, right, rig, camera, LogPolar(800))
+            match_external(matcher, views)
+    eyes = verged_views(left, right, verged(0.1, 0.2), Pinhole.from_fov(90.0, 100.0), 100.0)
+    for source, message in (
+        (answer(disparity), r"disparity\.shape"),
+        (3, "a function"),
+        (tmp_path / "d.npz", "a file has the disparity of a rectified pair"),
+    ):
+        with pytest.raises(SettingError, match=message):
+            match_external(source, eyes, LogPolar(800))
     for name, value in {
         "sure_px": -1.0, "unsure_px": -0.5, "power": 0.0, "least_confidence": 2.0, "edge_px": 0.0,
         "rectified_fov_deg": 170.0,

@@ -18,10 +18,12 @@ from torchfovea.sensing.correspondence import Budget, Disparity, eye_sigma_px
 from torchfovea.sensing.retina import LogPolar, Uniform
 from torchfovea.setting import SettingError
 from torchfovea.stereo.external import External
-from torchfovea.stereo.matching import SGBM, match_sgbm, posed, read_disparity, verged
-from torchfovea.stereo.rectified import match_disparity, match_rectified
-from torchfovea.stereo.sgbm import disparity_sgbm
+from torchfovea.stereo.maps import match_disparity, read_disparity
+from torchfovea.stereo.matching import match_sgbm
+from torchfovea.stereo.rig import posed, verged
+from torchfovea.stereo.sgbm import SGBM, disparity_sgbm
 from torchfovea.stereo.sweep import Sweep
+from torchfovea.stereo.views import rectified_views, verged_views
 
 BASELINE = 0.204
 SIZE = 240
@@ -95,6 +97,11 @@ def pair(camera, vergence, plane, **options):
     )
 
 
+def views_of(left, right, vergence, camera=PINHOLE):
+    """Two eyes' images, whose retinas have a radius of 100 px."""
+    return verged_views(left, right, verged(vergence, BASELINE), camera, 100.0)
+
+
 def truth(camera, vergence, plane, left_px):
     """The right eye's places, and the points in C."""
     left = np.array([-BASELINE / 2, 0, 0])
@@ -112,7 +119,7 @@ def truth(camera, vergence, plane, left_px):
 @pytest.mark.parametrize("retina", RETINAS, ids=["log_polar", "uniform"])
 def test_matches_a_plane(camera, plane, vergence, retina):
     left, right = pair(camera, vergence, plane)
-    found, disparity = match_sgbm(left, right, verged(vergence, BASELINE), camera, retina)
+    found, disparity = match_sgbm(views_of(left, right, vergence, camera), retina)
     left_px, right_px, valid = found.left_px.numpy(), found.right_px.numpy(), found.valid.numpy()
     expected, points = truth(camera, vergence, plane, left_px.astype(float))
     with np.errstate(invalid="ignore"):
@@ -142,9 +149,7 @@ def test_whole_pixels_draw_no_disparity(exposure):
     """Block matching alone errs by up to 0.2 px, by the phase of the true disparity; the readings do not."""
     plane, retina, focal = ((-0.2, 0.0, 1.0), 1.0), Uniform(12_000), PINHOLE.focal_px * SIZE / 200
     left, right = pair(PINHOLE, 0.0, plane)
-    found, _ = match_sgbm(
-        left, exposure[0] * right ** exposure[2] + exposure[1], verged(0.0, BASELINE), PINHOLE, retina
-    )
+    found, _ = match_sgbm(views_of(left, exposure[0] * right ** exposure[2] + exposure[1], 0.0), retina)
     expected, points = truth(PINHOLE, 0.0, plane, found.left_px.double().numpy())
     error = (expected - found.right_px.double().numpy())[:, 0] * SIZE / 200
     phase = np.floor(8 * (focal * BASELINE / points[:, 2] % 1)).astype(int)
@@ -181,13 +186,13 @@ def test_the_defaults_are_those_of_the_commands():
 
 def test_float64_and_colour_and_bytes_agree():
     left, right = pair(PINHOLE, 0.2, FACING)
-    rig = verged(torch.tensor(0.2), BASELINE)
-    grey, _ = match_sgbm(left, right, rig, PINHOLE, RETINAS[0])
-    double, _ = match_sgbm(left.double().numpy(), right.double().numpy(), rig, PINHOLE, RETINAS[0])
+    vergence = torch.tensor(0.2)
+    grey, _ = match_sgbm(views_of(left, right, vergence), RETINAS[0])
+    double, _ = match_sgbm(views_of(left.double().numpy(), right.double().numpy(), vergence), RETINAS[0])
     assert double.right_px.dtype == torch.float64 and grey.right_px.dtype == torch.float32
-    colour, _ = match_sgbm(left.expand(3, -1, -1), right.expand(3, -1, -1), rig, PINHOLE, RETINAS[0])
+    colour, _ = match_sgbm(views_of(left.expand(3, -1, -1), right.expand(3, -1, -1), vergence), RETINAS[0])
     bytes_ = [(image * 255).round().byte() for image in (left, right)]
-    coarse, _ = match_sgbm(*bytes_, rig, PINHOLE, RETINAS[0])
+    coarse, _ = match_sgbm(views_of(*bytes_, vergence), RETINAS[0])
     for other in (double, colour, coarse):
         both = grey.valid & other.valid
         assert both.sum() > 0.98 * grey.valid.sum()
@@ -197,7 +202,7 @@ def test_float64_and_colour_and_bytes_agree():
 def test_nothing_is_averaged_over_a_depth_edge():
     retina, box = LogPolar(12_000), (-0.1, 0.15, -0.15, 0.15, 0.55)
     left, right = pair(PINHOLE, 0.2, ((0.0, 0.0, 1.0), 1.2), box=box)
-    found, _ = match_sgbm(left, right, verged(0.2, BASELINE), PINHOLE, retina)
+    found, _ = match_sgbm(views_of(left, right, 0.2), retina)
     px = found.left_px[found.valid].double().numpy()
     eye = np.array([-BASELINE / 2, 0, 0])
     rays_left = numpy_rays(PINHOLE, px) @ turn(0.1).T
@@ -226,7 +231,7 @@ def test_a_posed_rig_is_the_verged_one():
 def test_without_texture_nothing_matches(params, value):
     image = torch.full((3, 90, 90), value)
     retina = LogPolar(1000)
-    found, disparity = match_sgbm(image, image, verged(0.1, BASELINE), PINHOLE, retina, params)
+    found, disparity = match_sgbm(views_of(image, image, 0.1), retina, params)
     assert not found.valid.any() and not disparity.valid.any()
     assert all(part.isfinite().all() for part in found[:4]) and found.left_px.shape == found.right_px.shape == (
         retina.count,
@@ -239,7 +244,7 @@ def test_unrelated_or_tiny_images_stay_well_formed():
     noise = torch.rand(2, 1, 90, 90, generator=torch.Generator().manual_seed(0))
     for left, right in (noise, noise[..., :4, :4], noise[..., :1, :1]):
         for vergence in (0.0, 0.5, 3.0):
-            found, _ = match_sgbm(left, right, verged(vergence, BASELINE), PINHOLE, retina)
+            found, _ = match_sgbm(views_of(left, right, vergence), retina)
             assert all(part.isfinite().all() for part in found[:4])
             assert found.valid.float().mean() < 0.5
             assert retina.inside(found.right_px[found.valid]).all()
@@ -247,16 +252,14 @@ def test_unrelated_or_tiny_images_stay_well_formed():
 
 def test_range_limits_are_kept():
     left, right = pair(PINHOLE, 0.2, SLANTED)
-    found, _ = match_sgbm(
-        left, right, verged(0.2, BASELINE), PINHOLE, RETINAS[0], nearest_range_m=0.8, farthest_range_m=1.0
-    )
+    found, _ = match_sgbm(views_of(left, right, 0.2), RETINAS[0], nearest_range_m=0.8, farthest_range_m=1.0)
     _, points = truth(PINHOLE, 0.2, SLANTED, found.left_px[found.valid].double().numpy())
     assert np.mean((points[:, 2] > 0.78) & (points[:, 2] < 1.04)) > 0.99
 
 
 def test_the_authors_parameters_work():
     left, right = pair(PINHOLE, 0.2, FACING)
-    found, _ = match_sgbm(left, right, verged(0.2, BASELINE), PINHOLE, RETINAS[0], SGBM.authors)
+    found, _ = match_sgbm(views_of(left, right, 0.2), RETINAS[0], SGBM.authors)
     expected, _ = truth(PINHOLE, 0.2, FACING, found.left_px.double().numpy())
     error = np.abs(found.right_px.numpy() - expected)[found.valid.numpy()]
     assert found.valid.float().mean() > 0.3 and np.median(error[:, 0]) < 0.3
@@ -295,38 +298,40 @@ def rectified_pair(doffs=7.0, size=(160, 220), plane=SLANTED, box=None):
 @pytest.mark.parametrize("gaze", [None, (100.0, 90.0)])
 def test_rectified_pairs(retina, gaze):
     images, (camera_left, camera_right), true = rectified_pair()
-    match = match_rectified(*images, camera_left, camera_right, 0.15, retina, gaze)
-    found = match.correspondences
+    views = rectified_views(*images, camera_left, camera_right, 0.15, gaze)
+    found, disparity = match_sgbm(views, retina)
+    eye, other = views.cameras(retina)
     # what both see, but for the matcher's own border
-    both = match_disparity(true, camera_left, camera_right, 0.15, retina, gaze).correspondences.valid
+    both = match_disparity(true, views, retina)[0].valid
     assert both.float().mean() > 0.75
     assert found.valid[both].float().mean() > 0.98
     assert found.valid[~both].float().mean() < 0.05
     # triangulated by hand: depth from the difference of the normalized columns, in the cameras returned
     left, right = found.left_px[found.valid].double(), found.right_px[found.valid].double()
-    x, y, _ = match.camera_left.rays(left).unbind(-1)
-    depth = 0.15 / (x - match.camera_right.rays(right)[:, 0])
+    x, y, _ = eye.rays(left).unbind(-1)
+    depth = 0.15 / (x - other.rays(right)[:, 0])
     points = torch.stack([x * depth, y * depth, depth], -1).numpy()
     off = np.abs(points @ np.array(SLANTED[0]) - SLANTED[1])
     assert np.median(off) < 0.01
     assert torch.equal(right[:, 1], left[:, 1])
-    scale = camera_left.focal_px / match.camera_left.focal_px
+    scale = camera_left.focal_px / eye.focal_px
     assert scale == (1 if retina is None else pytest.approx(160 / 200))
-    error = (match.disparity.disparity - torch.as_tensor(true))[match.disparity.valid].abs()
+    error = (disparity.disparity - torch.as_tensor(true))[disparity.valid].abs()
     assert error.median() < 0.3
     torch.testing.assert_close(
-        match.disparity.depth_m()[80, 100].double(), torch.as_tensor(27 / (true[80, 100] + 7)), rtol=0.05, atol=0
+        disparity.depth_m()[80, 100].double(), torch.as_tensor(27 / (true[80, 100] + 7)), rtol=0.05, atol=0
     )
 
 
 @pytest.mark.parametrize("retina", [LogPolar(2000), Uniform(2000), None])
 def test_true_disparity_gives_true_points(retina):
-    _, (camera_left, camera_right), true = rectified_pair()
-    match = match_disparity(true, camera_left, camera_right, 0.15, retina)
-    found = match.correspondences
+    images, cameras, true = rectified_pair()
+    views = rectified_views(*images, *cameras, 0.15)
+    found, _ = match_disparity(true, views, retina)
+    eye, other = views.cameras(retina)
     left, right = (px[found.valid] for px in found[:2])
-    x, y, _ = match.camera_left.rays(left).unbind(-1)
-    depth = 0.15 / (x - match.camera_right.rays(right)[:, 0])
+    x, y, _ = eye.rays(left).unbind(-1)
+    depth = 0.15 / (x - other.rays(right)[:, 0])
     points = torch.stack([x * depth, y * depth, depth], -1).numpy()
     assert left.dtype == torch.float64 and found.valid.float().mean() > 0.8
     # disparity is linear on a plane: exact but for pixels
@@ -340,15 +345,16 @@ def test_true_disparity_gives_true_points(retina):
 
 
 def test_holes_in_a_disparity_map():
-    _, (camera_left, camera_right), true = rectified_pair()
+    images, cameras, true = rectified_pair()
+    views = rectified_views(*images, *cameras, 0.15)
     true[:, :50], true[60:70] = np.nan, np.inf
     trusted = np.ones_like(true, bool)
     trusted[100:110] = False
-    found = match_disparity(true, camera_left, camera_right, 0.15, valid=trusted).correspondences
+    found = match_disparity(true, views, valid=trusted)[0]
     valid = found.valid.reshape(true.shape)
     assert not valid[:, :50].any() and not valid[60:70].any() and not valid[100:110].any()
     assert valid[20:50, 60:200].all() and found.right_px.isfinite().all()
-    assert not match_disparity(np.full((9, 9), np.nan), camera_left, camera_right, 0.15).correspondences.valid.any()
+    assert not match_disparity(np.full_like(true, np.nan), views)[0].valid.any()
 
 
 def test_reading_a_disparity_keeps_to_one_surface():
@@ -370,14 +376,14 @@ def test_motorcycle_fovea_is_as_good_as_plain_matching():
     images = [torch.as_tensor(image).permute(2, 0, 1) for image in (left, right)]
     cameras = Pinhole(994.978, 311.193, 254.877), Pinhole(994.978, 311.193 + 31.086, 254.877)
     retina = LogPolar()
-    match = match_rectified(*images, *cameras, 0.193001, retina, nearest_range_m=1.5)
-    plain = match_rectified(*images, *cameras, 0.193001, None, nearest_range_m=1.5)
-    found = match.correspondences
+    views = rectified_views(*images, *cameras, 0.193001)
+    found, _ = match_sgbm(views, retina, nearest_range_m=1.5)
+    _, plain = match_sgbm(views, None, nearest_range_m=1.5)
     place = found.left_px * 2.5 + torch.tensor([370.0, 249.5])
     column, row = place.round().long().unbind(-1)
     expected = torch.as_tensor(true)[row, column]
     ours = 2.5 * (found.left_px - found.right_px)[:, 0]
-    theirs, there = read_disparity(plain.disparity, place, 1.0)
+    theirs, there = read_disparity(plain, place, 1.0)
     known = expected.isfinite()
     fovea = known & (found.left_px.norm(dim=-1) < 15)
     assert found.valid[known].float().mean() > 0.9 and found.valid[fovea].float().mean() > 0.98
@@ -392,32 +398,25 @@ def test_motorcycle_fovea_is_as_good_as_plain_matching():
 # ------------------------------------------------------------------------------------------------------------- errors
 
 GOOD = torch.rand(3, 40, 40)
-RIG = verged(0.1, BASELINE)
+VIEWS, PAIR = views_of(GOOD, GOOD, 0.1), rectified_views(GOOD, GOOD, PINHOLE, PINHOLE, 0.1)
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: match_sgbm(torch.rand(2, 40, 40), GOOD, RIG, PINHOLE, LogPolar(500)), "left.shape"),
-        (lambda: match_sgbm(GOOD, torch.rand(40, 40), RIG, PINHOLE, LogPolar(500)), "right.shape"),
-        (lambda: match_sgbm(GOOD, torch.rand(3, 40, 41), RIG, PINHOLE, LogPolar(500)), "right.shape"),
-        (lambda: match_sgbm(GOOD, torch.rand(3, 0, 40), RIG, PINHOLE, LogPolar(500)), "right.shape"),
-        (lambda: match_sgbm(GOOD * math.nan, GOOD, RIG, PINHOLE, LogPolar(500)), "left = NaN"),
-        (lambda: match_sgbm(GOOD, GOOD / 0, RIG, PINHOLE, LogPolar(500)), "right = NaN"),
-        (lambda: match_sgbm(GOOD * 255, GOOD, RIG, PINHOLE, LogPolar(500)), "left = .*\\[0, 1\\]"),
-        (lambda: match_sgbm(GOOD.long(), GOOD, RIG, PINHOLE, LogPolar(500)), "left.dtype"),
-        (lambda: match_sgbm(GOOD, GOOD, RIG, PINHOLE, LogPolar(500), nearest_range_m=0), "nearest_range_m = 0"),
-        (lambda: match_sgbm(GOOD, GOOD, RIG, PINHOLE, LogPolar(500), farthest_range_m=0.1), "farthest_range_m = 0.1"),
+        (lambda: match_sgbm(VIEWS, LogPolar(500), nearest_range_m=0), "nearest_range_m = 0"),
+        (lambda: match_sgbm(VIEWS, LogPolar(500), farthest_range_m=0.1), "farthest_range_m = 0.1"),
+        (lambda: match_sgbm(VIEWS, None), "retina = None"),
+        (lambda: match_sgbm(views_of(GOOD[None], GOOD[None], 0.1), LogPolar(500)), "left.shape"),
         (lambda: verged(4.0, BASELINE), "vergence_rad = 4"),
         (lambda: verged(0.1, -1.0), "baseline_m = -1"),
         (lambda: posed(torch.eye(3), torch.tensor([-0.1, 0, 0])), "t_left_right_m"),
         (lambda: posed(2 * torch.eye(3), torch.tensor([0.1, 0, 0])), "R_left_right"),
         (lambda: posed(torch.eye(2), torch.tensor([0.1, 0, 0])), "R, t"),
-        (lambda: match_rectified(GOOD, GOOD, PINHOLE, Pinhole(3.0), 0.1), "camera_right"),
-        (lambda: match_rectified(GOOD, GOOD, PINHOLE, PINHOLE, 0.0), "baseline_m = 0"),
-        (lambda: match_rectified(GOOD, GOOD, PINHOLE, PINHOLE, 0.1, LogPolar(500), (math.nan, 0)), "gaze_px"),
-        (lambda: match_disparity(torch.rand(3, 4, 5), PINHOLE, PINHOLE, 0.1), "disparity.shape"),
-        (lambda: match_disparity(torch.rand(4, 5), PINHOLE, PINHOLE, 0.1, valid=np.ones((4, 5))), "valid"),
+        (lambda: match_disparity(torch.rand(3, 40, 40), PAIR), "disparity.shape"),
+        (lambda: match_disparity(torch.rand(40, 41), PAIR), "disparity.shape"),
+        (lambda: match_disparity(torch.rand(40, 40), PAIR, valid=np.ones((40, 40))), "valid"),
+        (lambda: match_disparity(torch.rand(40, 40), VIEWS), "views = .*rectified_views"),
         (lambda: Budget(sigma_over_width=0), "sigma_over_width = 0"),
         (lambda: Budget(source_px=0), "source_px = 0"),
         (lambda: Budget(match_px=-1), "match_px = -1"),

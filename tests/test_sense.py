@@ -50,12 +50,18 @@ def sense(capsys, *overrides):
     return run, json.loads((run / "result.json").read_text())
 
 
+def points_of(run):
+    """points.npz, closed again."""
+    with np.load(run / "points.npz") as file:
+        return dict(file)
+
+
 def test_the_motorcycle(folder, capsys):
     run, result = sense(capsys, "pair=motorcycle", "sensor.receptive_fields=12000")
     assert result["valid_fraction"] > 0.8 and result["median_error_m"] < 0.05
     assert result["coverage_50"] < result["coverage_90"] <= result["coverage_95"] <= result["coverage_99"]
     assert {"points.ply", "points.npz", "sense.png", "result.json"} <= {p.name for p in run.iterdir()}
-    points = np.load(run / "points.npz")
+    points = points_of(run)
     assert len(points["mean_m"]) == result["points"] and np.isfinite(points["cov_m2"]).all()
     assert 1.5 < np.median(points["mean_m"][:, 2]) < 5
     assert len(points["inlier"]) == result["points"] and ((points["inlier"] > 0) & (points["inlier"] <= 1)).all()
@@ -70,7 +76,7 @@ def test_points_survive_a_judgement_that_fails(folder, capsys, plane):
     """A truth of another sign: nothing lies within 5 standard deviations, and the points are there."""
     np.save("wrong.npy", np.full(SIZE, 150, np.float32))
     run, result = sense(capsys, *plane, "disparity=wrong.npy", "sensor.receptive_fields=4000", "matcher=sgbm")
-    assert len(np.load(run / "points.npz")["mean_m"]) == result["points"] > 500
+    assert len(points_of(run)["mean_m"]) == result["points"] > 500
     assert result["valid_fraction"] > 0.5 and result.get("outlier_share", 1) == 1
 
 
@@ -84,7 +90,7 @@ def test_own_files_with_truth(folder, capsys, plane, sensor):
 
 def test_offset_axes_are_the_same_geometry(folder, capsys, plane):
     run, _ = sense(capsys, *plane, "doffs_px=6", "sensor=every_pixel", "matcher=sgbm")
-    depth = np.median(np.load(run / "points.npz")["mean_m"][:, 2])
+    depth = np.median(points_of(run)["mean_m"][:, 2])
     assert depth == pytest.approx(FOCAL * BASELINE / 18, rel=0.01)
 
 
@@ -137,7 +143,7 @@ def test_an_image_without_texture_gives_no_points_and_no_error(folder, capsys):
     own = ["left=grey.png", "right=grey.png", "focal_px=180", "cx_px=99.5", "cy_px=79.5", "baseline_m=0.1"]
     run, result = sense(capsys, *own, "sensor.receptive_fields=2000")
     assert result["points"] == 0 and result["valid_fraction"] == 0
-    assert len(np.load(run / "points.npz")["mean_m"]) == 0
+    assert len(points_of(run)["mean_m"]) == 0
 
 
 def test_disparity_files(tmp_path):

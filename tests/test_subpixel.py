@@ -10,7 +10,7 @@ from torchfovea.sensing.camera import Pinhole
 from torchfovea.sensing.layout import Uniform
 from torchfovea.stereo.costs import Eye, acuity
 from torchfovea.stereo.sheets import sheets
-from torchfovea.stereo.subpixel import subpixel
+from torchfovea.stereo.subpixel import Neighbourhood, subpixel
 
 SIZE, BASELINE_M, FOCAL_PX = 120, 0.1, 200.0
 RETINA = Uniform(round(math.pi * SIZE**2 / 4), radius_px=SIZE / 2)  # an RF is about a pixel
@@ -42,7 +42,7 @@ def refined(true_px, start_px, contrast=0.15, noise=0.0, gain=1.0, seed=0):
     reach = FOCAL_PX * BASELINE_M
     surface = torch.full_like(sheet.width_px, start_px / reach)[None]
     unit = sheet.width_px[None] / reach
-    found = subpixel(eye, sheet, surface, unit, torch.ones_like(surface) > 0, 2, 0.004, 0.2)
+    found = subpixel(eye, sheet, surface, unit, torch.ones_like(surface) > 0, Neighbourhood(2, 0.004, 0.2))
     inner = (sheet.px.norm(dim=-1) < SIZE / 2 - 14)[None]
     error = (surface + found.value * unit - true_px / reach) * reach
     return error[inner], (found.variance.sqrt() * unit * reach)[inner], found.correlation[inner]

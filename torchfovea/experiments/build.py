@@ -179,9 +179,9 @@ def build_arena(cfg: DictConfig, observer: Observer, seed: int) -> Arena:
 
 
 def build_match(cfg: DictConfig) -> Match:
-    """The stereo matcher of two verged eyes, built in or a user's own."""
+    """The stereo matcher, built in or a user's own."""
     name_of(cfg, "matcher")
-    form = "a function (left, right, rig, camera, retina, budget) that returns (Correspondences, found)"
+    form = "a function (views, retina, budget) that returns (Correspondences, found)"
     target = OmegaConf.select(cfg, "matcher._target_") or targets_of("matcher", "name").get(cfg.matcher.name)
     ours = isinstance(target, str) and target.startswith("torchfovea.")
     made = build_named(cfg, "matcher", form, MATCHER if ours else ("name",))
@@ -193,13 +193,13 @@ def build_match(cfg: DictConfig) -> Match:
 
 
 def build_matcher(cfg: DictConfig) -> Matcher:
-    """The stereo matcher, where it must be one that also matches rectified pairs.
+    """The stereo matcher, where it must be a built-in one, whose clues are known.
 
     Raises:
         SettingError: for a user's own whole matcher.
     """
     matcher = build_match(cfg)
-    expected = "sgbm, sweep or external; one of your own matches in search"
+    expected = "sgbm, sweep or external; one of your own matches in search and sense"
     require(isinstance(matcher, Matcher), "matcher", OmegaConf.select(cfg, "matcher.name"), expected)
     assert isinstance(matcher, Matcher)
     return matcher

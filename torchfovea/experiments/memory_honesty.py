@@ -21,6 +21,7 @@ from torchfovea.sensing.head import Gaze, eyes
 from torchfovea.setting import require
 from torchfovea.sim.arena import Arena
 from torchfovea.stereo.rig import verged
+from torchfovea.stereo.views import verged_views
 from torchfovea.studies.significance import bootstrap_interval
 
 __all__ = ["study_honesty"]
@@ -125,8 +126,9 @@ def _look(seeing: dict[str, Sensor], gaze: Gaze, generator: torch.Generator) -> 
             if pictures is None:
                 pictures = [frame.image for frame in arena.world.images(gaze)]
             left, right = pictures
-            rig, budget = verged(gaze.vergence, observer.head.baseline_m), observer.budget
-            matches, _ = arena.matcher(left, right, rig, observer.camera, observer.retina, budget)
+            rig, retina = verged(gaze.vergence, observer.head.baseline_m), observer.retina
+            views = verged_views(left, right, rig, observer.camera, retina.radius_px)
+            matches, _ = arena.matcher(views, retina, observer.budget)
         pose = eyes(observer.head, gaze)
         for n, mind in minds.items():
             seeing[name].minds[n] = perceive(observer, mind, matches, pose)

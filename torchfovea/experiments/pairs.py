@@ -16,6 +16,7 @@ from torchfovea.experiments.settings import choice
 from torchfovea.sensing.camera import Pinhole
 from torchfovea.setting import SettingError, require
 from torchfovea.stereo.disparity_files import load_disparity
+from torchfovea.stereo.views import Views, rectified_views
 
 __all__ = ["Pair", "gaze_of", "load_folder", "load_pair", "motorcycle", "named_pair"]
 
@@ -40,6 +41,10 @@ class Pair(NamedTuple):
     camera_right: Pinhole
     baseline_m: float
     disparity: Tensor | None
+
+    def views(self, gaze_px: tuple[float, float] | None) -> Views:
+        """What a matcher is given of it, with retinas that look at a pixel (column, row), or at the middle."""
+        return rectified_views(*self[:5], gaze_px)
 
     def depth_m(self, disparity: Tensor) -> Tensor:
         """Depth of disparities along the view's axis [m]."""

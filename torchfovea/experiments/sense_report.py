@@ -12,9 +12,10 @@ from torchfovea.experiments.regions import hidden_places
 from torchfovea.gaussian import Gaussian
 from torchfovea.sensing.layout import Retina
 from torchfovea.sensing.triangulation import Observations
-from torchfovea.stereo.rectified import RectifiedMatch, match_disparity
+from torchfovea.stereo.maps import match_disparity
+from torchfovea.stereo.views import Views
 
-__all__ = ["beside", "figures_of", "read_map"]
+__all__ = ["beside", "figures_of", "read_at_fields"]
 
 LEVELS = (0.5, 0.9, 0.95, 0.99)
 OUTLIER = 5.0  # standard deviations
@@ -22,22 +23,23 @@ OUTLIER = 5.0  # standard deviations
 
 def figures_of(
     pair: Pair,
+    views: Views,
+    retina: Retina | None,
+    px: Tensor,
     observed: Observations,
     points: Gaussian,
-    match: RectifiedMatch,
     chosen: Tensor,
-    retina: Retina | None,
-    gaze_px: tuple[float, float] | None,
 ) -> dict[str, float]:
     """Counts, and errors and honesty against the true disparity where the pair has one.
 
     The truth lies on the left ray, so that one degree of freedom is left to err in: the inverse range. Coverage is that
-    of the Gaussian over all valid points; ``inlier_*`` is over those whose inlier probability exceeds 1/2.
+    of the Gaussian over all valid points; ``inlier_*`` is over those whose inlier probability exceeds 1/2. The
+    receptive fields are at `px` (N, 2).
 
     Returns:
         Each figure by field; and as ``*_by_area``, every field weighted by the area that it stands for.
     """
-    px, valid = match.correspondences.left_px, observed.valid
+    valid = observed.valid
     area = torch.ones_like(px[:, 0]) if retina is None else retina.width_px(px).square()
     kinds = {"": torch.ones_like(area), "_by_area": area}
     inlier = valid.to(area) if observed.inlier is None else observed.inlier
@@ -46,9 +48,9 @@ def figures_of(
     figures |= {f"inlier_mean{k}": _mean(inlier, w * valid) for k, w in kinds.items() if bool(valid.any())}
     if pair.disparity is None:
         return figures
-    depth = pair.depth_m(read_map(pair, pair.disparity, None, retina, gaze_px))
-    length = match.camera_left.rays(px).norm(dim=-1)
-    hidden = read_map(pair, hidden_places(pair.disparity).float(), None, retina, gaze_px) > 0.5
+    depth = pair.depth_m(read_at_fields(pair.disparity, views, retina))
+    length = views.cameras(retina)[0].rays(px).norm(dim=-1)
+    hidden = read_at_fields(hidden_places(pair.disparity).float(), views, retina) > 0.5
     known = torch.isfinite(depth)
     error = observed.mean[:, 2] - 1 / (depth * length)
     z = (error / observed.cov[:, 5].sqrt()).abs()
@@ -72,16 +74,11 @@ def figures_of(
 
 
 def beside(
-    pair: Pair,
-    observed: Observations,
-    points: Gaussian,
-    plain: Tensor,
-    retina: Retina,
-    gaze_px: tuple[float, float] | None,
+    pair: Pair, views: Views, retina: Retina, observed: Observations, points: Gaussian, plain: Tensor
 ) -> dict[str, float]:
     """Both matchers at the receptive fields where both found something and the truth is known."""
     assert pair.disparity is not None
-    depth, peer = pair.depth_m(read_map(pair, pair.disparity, None, retina, gaze_px)), pair.depth_m(plain)
+    depth, peer = pair.depth_m(read_at_fields(pair.disparity, views, retina)), pair.depth_m(plain)
     common = observed.valid & torch.isfinite(depth) & torch.isfinite(peer)
     figures = {"plain_valid_fraction": float(torch.isfinite(peer).double().mean())}
     if bool(common.any()):
@@ -90,16 +87,10 @@ def beside(
     return figures
 
 
-def read_map(
-    pair: Pair, values: Tensor, valid: Tensor | None, retina: Retina | None, gaze_px: tuple[float, float] | None
-) -> Tensor:
+def read_at_fields(values: Tensor, views: Views, retina: Retina | None, valid: Tensor | None = None) -> Tensor:
     """A disparity map read at the receptive fields, (N,); NaN where there is none [px of the image]."""
-    match = match_disparity(
-        values, pair.camera_left, pair.camera_right, pair.baseline_m, retina, gaze_px, valid, None, 1e-3
-    )
-    scale = pair.camera_left.focal_px / match.camera_left.focal_px
-    found = match.correspondences
-    shift = (found.left_px - found.right_px)[:, 0] * scale
+    found, _ = match_disparity(values, views, retina, nearest_range_m=1e-3, valid=valid)
+    shift = (found.left_px - found.right_px)[:, 0] * views.scale(retina)
     return torch.where(found.valid, shift, torch.full_like(shift, torch.nan))
 
 

@@ -16,9 +16,10 @@ from torchfovea.sensing.head import Eyes, Gaze, eyes
 from torchfovea.sensing.layout import Retina
 from torchfovea.setting import SettingError
 from torchfovea.sim.world import World
-from torchfovea.stereo.matchers import Matcher, match_eyes, match_pair
-from torchfovea.stereo.rectified import match_disparity
+from torchfovea.stereo.maps import match_disparity
+from torchfovea.stereo.matchers import Matcher
 from torchfovea.stereo.rig import verged
+from torchfovea.stereo.views import verged_views
 from torchfovea.studies.calibration import Judged, judged, select
 
 __all__ = ["Truths", "look_at_pair", "look_at_world"]
@@ -48,7 +49,8 @@ def look_at_world(world: World, gaze: Gaze, retina: Retina, budget: Budget, matc
     """Match both eyes' pictures; the truth is cast along the left receptive fields' rays."""
     left, right = world.images(gaze)
     rig, pose = verged(gaze.vergence, world.head.baseline_m), eyes(world.head, gaze)
-    matches, found = match_eyes(matcher, left.image, right.image, rig, world.camera, retina, budget)
+    views = verged_views(left.image, right.image, rig, world.camera, retina.radius_px)
+    matches, found = matcher(views, retina, budget)
     seen = world.correspond(gaze, world.camera.rays(matches.left_px))
     away = torch.linalg.vector_norm(seen.points_e.double() - pose.t_left, dim=-1)
     truth = torch.where(seen.hit, 1 / away, torch.zeros_like(away))
@@ -74,24 +76,19 @@ def look_at_pair(
     """
     if pair.disparity is None:
         raise SettingError("disparity = null: expected the true disparity of the pair, to judge by")
-    height, width = pair.left.shape[-2:]
-    cameras = pair.camera_left, pair.camera_right, pair.baseline_m
-    true = match_disparity(pair.disparity, *cameras, retina, gaze_px, nearest_range_m=1e-3)
-    scale = pair.camera_left.focal_px / true.camera_left.focal_px
-    middle = true.correspondences.left_px.new_tensor(gaze_px or ((width - 1) / 2, (height - 1) / 2))
+    views = pair.views(gaze_px)
+    true, _ = match_disparity(pair.disparity, views, retina, nearest_range_m=1e-3)
+    scale, (left, right) = views.scale(retina), views.cameras(retina)
     same = torch.eye(3)
     pose = Eyes(same, torch.zeros(3), same, torch.tensor([pair.baseline_m, 0.0, 0.0]))
-    budget = replace(budget, source_px=min(height, width))
-    found = match_pair(matcher, pair.left, pair.right, *cameras, retina, gaze_px, budget)
-    matches = found.correspondences
-    truth = _inverse_range(true.correspondences, true.camera_left, true.camera_right, pair.baseline_m)
-    known = true.correspondences.valid
+    budget = replace(budget, source_px=views.source_px)
+    matches, found = matcher(views, retina, budget)
+    truth = _inverse_range(true, left, right, pair.baseline_m)
+    known = true.valid
     truth = torch.where(known, truth, torch.zeros_like(truth))
-    region = _at(regions(pair.disparity, pair.left), matches.left_px * scale + middle)
-    data, which = judged(
-        matches, pose, true.camera_left, retina, budget, truth, found.disparity.clues, true.camera_right, region=region
-    )
-    ray = torch.nn.functional.normalize(true.camera_left.rays(matches.left_px), dim=-1)
+    region = _at(regions(pair.disparity, pair.left), matches.left_px * scale + true.left_px.new_tensor(views.gaze_px))
+    data, which = judged(matches, pose, left, retina, budget, truth, found.clues, right, region=region)
+    ray = torch.nn.functional.normalize(left.rays(matches.left_px), dim=-1)
     points = ray / torch.where(known, truth, torch.ones_like(truth))[:, None]
     step = truth_step_px(pair.disparity)
     return _told(data, which, points.double(), matches, region, known, retina, 1 / scale, step, same[2])

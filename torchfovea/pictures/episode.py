@@ -35,12 +35,13 @@ def _kept(image: Tensor, retina: Retina) -> np.ndarray:
     return np.asarray(kept[0].movedim(0, -1).clamp(0, 1))
 
 
-def _found(found: Disparity | SweepRange, retina: Retina, size_px: int) -> tuple[np.ndarray, str]:
+def _found(found: Disparity | SweepRange, retina: Retina | None, size_px: int) -> tuple[np.ndarray, str]:
     """What a matcher found as a picture, NaN where nothing, and its title."""
     if isinstance(found, Disparity):
         return np.where(np.asarray(found.valid), np.asarray(found.disparity), np.nan), (
             "disparity of the rectified left view [px]"
         )
+    assert retina is not None  # the sweep has no other fields
     both = torch.stack([found.inverse_range, found.valid.to(found.inverse_range)]).detach().cpu()
     value, weight = reconstruct(both[None], retina, size_px)[0][0]
     return np.asarray(torch.where(weight > 0.5, value / weight.clamp(min=0.5), torch.nan)), "inverse range found [1/m]"
@@ -154,13 +155,14 @@ def draw_episode(path: Path, episode: Episode, retina: Retina, title: str) -> No
     write_figure(path, figure, dpi=80)
 
 
-def draw_sense(path: Path, left: Tensor, disparity: Disparity, observed: Observations, px: Tensor) -> None:
-    """Draw a sensed pair: the left image, the disparity, each point's range and its relative uncertainty.
+def draw_sense(path: Path, left: Tensor, found: Any, retina: Retina | None, observed: Observations, px: Tensor) -> None:
+    """Draw a sensed pair: the left image, what the matcher found, each point's range and its relative uncertainty.
 
     Args:
         path: the PNG to write.
         left: (3, H, W).
-        disparity: what the matcher found.
+        found: a `Disparity`, a `SweepRange`, or what is not drawn.
+        retina: of a `SweepRange`.
         observed: in inverse range.
         px: the receptive fields, (N, 2), for the two maps.
     """
@@ -168,9 +170,10 @@ def draw_sense(path: Path, left: Tensor, disparity: Disparity, observed: Observa
     axes = figure.subplots(2, 2)
     axes[0, 0].imshow(np.asarray(left.movedim(0, -1)).clip(0, 1))
     axes[0, 0].set_title("left image")
-    values = np.where(np.asarray(disparity.valid), np.asarray(disparity.disparity), np.nan)
-    figure.colorbar(axes[0, 1].imshow(values, cmap="viridis"), ax=axes[0, 1], label="px")
-    axes[0, 1].set_title("disparity of what the retina keeps")
+    if isinstance(found, Disparity | SweepRange):
+        values, name = _found(found, retina, min(left.shape[-2:]))
+        figure.colorbar(axes[0, 1].imshow(values, cmap="viridis"), ax=axes[0, 1])
+        axes[0, 1].set_title(name)
     keep = observed.valid & (observed.mean[:, 2] > 0)
     rho, sigma = observed.mean[keep, 2], observed.cov[keep, 5].sqrt()
     maps = (

@@ -18,6 +18,7 @@ from torchfovea.sim.world import World
 from torchfovea.stereo.matchers import Match, checked_matches
 from torchfovea.stereo.rig import verged
 from torchfovea.stereo.sweep import SweepRange
+from torchfovea.stereo.views import verged_views
 
 __all__ = ["Arena", "Pictures", "draw_fields"]
 
@@ -83,10 +84,8 @@ class Arena:
         if self.matcher is not None:
             left, right = self.world.images(gaze)
             rig = verged(believed.vergence, observer.head.baseline_m)
-            matches, found = checked_matches(
-                self.matcher(left.image, right.image, rig, observer.camera, observer.retina, observer.budget),
-                observer.retina,
-            )
+            views = verged_views(left.image, right.image, rig, observer.camera, observer.retina.radius_px)
+            matches, found = checked_matches(self.matcher(views, observer.retina, observer.budget), observer.retina)
             chosen = draw_fields(observer.retina.count, self.sample, generator)
             if chosen is not None:
                 matches = matches.take(chosen)

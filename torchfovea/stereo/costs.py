@@ -15,8 +15,8 @@ from torch import Tensor
 from torchfovea.gaussian import columns
 from torchfovea.sensing.camera import Camera, Pinhole
 from torchfovea.sensing.retina import Retina, halve
-from torchfovea.stereo.rig import StereoRig
 from torchfovea.stereo.sheets import Sheet, average
+from torchfovea.stereo.views import Views
 
 __all__ = [
     "Eye",
@@ -78,26 +78,22 @@ class Looks(NamedTuple):
 PLANE = 0.5
 
 
-def left_eye(
-    pair: Tensor, rig: StereoRig, camera: Camera, camera_right: Camera, retina: Retina, middle: tuple[float, float]
-) -> Eye:
+def left_eye(pair: Tensor, views: Views, retina: Retina) -> Eye:
     """The left eye that looks for its RFs' likes in the right one.
 
     Args:
-        pair: (2B, 1, H, W), all left images first; the retina spans the shorter side.
-        rig: the eyes' poses.
-        camera: the left eye's, in retinal pixels.
-        camera_right: the right eye's.
+        pair: (2B, 1, H, W), both eyes' images in grey, all left ones first.
+        views: their cameras, and how these stand.
         retina: of both.
-        middle: image pixel of both optical axes.
     """
-    scale = min(pair.shape[-2:]) / (2 * retina.radius_px)
+    scale, middle, rig = views.scale(retina), views.gaze_px, views.rig
     levels = acuity(pair, retina, scale, middle)
     batch = len(pair) // 2
     R_left, R_right = (r.to(pair).expand(batch, 3, 3) for r in (rig.R_left, rig.R_right))
     shift = -(R_right.mT @ pair.new_tensor([rig.baseline_m, 0.0, 0.0]))
+    camera, other = views.cameras(retina)
     mine, theirs = levels[:batch], levels[batch:]
-    return Eye(camera, camera_right, R_right.mT @ R_left, shift, R_left[:, 2], mine, theirs, retina, scale, middle)
+    return Eye(camera, other, R_right.mT @ R_left, shift, R_left[:, 2], mine, theirs, retina, scale, middle)
 
 
 def acuity(images: Tensor, retina: Retina, scale: float, middle: tuple[float, float]) -> Tensor:

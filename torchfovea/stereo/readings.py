@@ -14,13 +14,9 @@ from torch import Tensor
 
 from torchfovea.stereo.costs import Eye, sheet_depth, sheet_rays
 from torchfovea.stereo.sheets import read_sheet, sheets
-from torchfovea.stereo.subpixel import smoothed, steps_per_width, subpixel
+from torchfovea.stereo.subpixel import Neighbourhood, smoothed, steps_per_width, subpixel
 
-__all__ = ["RADIUS", "Reading", "refine_reading"]
-
-RADIUS = 2  # of the neighbourhoods, in RFs
-NOISE = 0.004  # of either image, at least: a grey level of 255
-SMOOTH = 0.2  # of one surface's offsets about their surroundings', in widths
+__all__ = ["Reading", "refine_reading"]
 
 
 class Reading(NamedTuple):
@@ -69,7 +65,7 @@ def refine_reading(
         level = smoothed(there[None], edge, trusted)
         step = (depth / reach_px_m)[None].clamp(min=1e-9)  # sheets count inverse depth as their rays do
         width_px = steps_per_width(eye, sheet, ray, level * step, step)
-        offset = subpixel(eye, sheet, level * step, width_px * step, trusted, RADIUS, NOISE, SMOOTH)
+        offset = subpixel(eye, sheet, level * step, width_px * step, trusted, Neighbourhood())
         value = torch.where(offset.value.abs() < 1, offset.value, torch.zeros_like(level))
         by = level - there + value * width_px
         values = torch.stack([by, offset.variance.sqrt() * width_px, 1 - offset.correlation], 1)

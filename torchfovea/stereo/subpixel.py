@@ -33,10 +33,24 @@ from torchfovea.gaussian import columns
 from torchfovea.stereo.costs import Eye, project, read_other, read_own, sheet_rays
 from torchfovea.stereo.sheets import Sheet, average
 
-__all__ = ["Offset", "smoothed", "steps_per_width", "subpixel"]
+__all__ = ["Neighbourhood", "Offset", "smoothed", "steps_per_width", "subpixel"]
 
 WIDE = 3  # surroundings are nine neighbourhoods, so many cells apart
 STEP = 0.5  # of the derivatives, in units
+
+
+class Neighbourhood(NamedTuple):
+    """What the cells about a place are believed to be.
+
+    Attributes:
+        radius: half their square's side, in cells.
+        noise: standard deviation of each image's noise, at least.
+        smooth: standard deviation of one surface's offsets about their surroundings', in units.
+    """
+
+    radius: int = 2
+    noise: float = 0.004  # a grey level of 255
+    smooth: float = 0.2
 
 
 class Offset(NamedTuple):
@@ -55,9 +69,7 @@ class Offset(NamedTuple):
     misfit: Tensor
 
 
-def subpixel(
-    eye: Eye, sheet: Sheet, surface: Tensor, unit: Tensor, trusted: Tensor, radius: int, noise: float, smooth: float
-) -> Offset:
+def subpixel(eye: Eye, sheet: Sheet, surface: Tensor, unit: Tensor, trusted: Tensor, about: Neighbourhood) -> Offset:
     """Refine surfaces on a sheet by both eyes' images.
 
     Args:
@@ -66,13 +78,11 @@ def subpixel(
         surface: (B, R, S), inverse depths to within about a unit [1/m].
         unit: (B, R, S), the inverse depth that moves the match by an RF's width [1/m].
         trusted: bool (B, R, S), which of them a neighbourhood may count on.
-        radius: half the side of a neighbourhood, in cells.
-        noise: standard deviation of each image's noise, at least.
-        smooth: standard deviation of one surface's offsets about their surroundings', in units.
+        about: each cell's neighbourhood.
 
     Differentiable in the images.
     """
-    closed = sheet.closed
+    closed, (radius, noise, smooth) = sheet.closed, about
     ray = sheet_rays(eye, sheet.px)
     places = torch.stack([surface - STEP * unit, surface, surface + STEP * unit], 1)
     before, right, after = read_other(eye, sheet, ray, places).unbind(1)

@@ -13,7 +13,7 @@ from torchfovea.setting import require
 from torchfovea.stereo.costs import Eye, correlate, own_values, project, sheet_rays, spread
 from torchfovea.stereo.semiglobal import aggregate
 from torchfovea.stereo.sheets import Sheet, nearest_rf, read_sheet
-from torchfovea.stereo.subpixel import smoothed, steps_per_width, subpixel
+from torchfovea.stereo.subpixel import Neighbourhood, smoothed, steps_per_width, subpixel
 
 __all__ = ["Estimate", "Sweep", "Winner", "match_sheet", "refine", "win"]
 
@@ -174,7 +174,8 @@ def refine(eye: Eye, sheet: Sheet, winner: Winner, params: Sweep) -> Estimate:
         unit = winner.step * steps_per_width(eye, sheet, ray, surface, winner.step)
         seen = project(eye, ray, surface[:, None])[2]
         trusted = winner.clear & seen[:, 0] & eye.retina.inside(sheet.px)
-    offset = subpixel(eye, sheet, surface, unit, trusted, params.refine_window, params.noise, params.winner_widths)
+    about = Neighbourhood(params.refine_window, params.noise, params.winner_widths)
+    offset = subpixel(eye, sheet, surface, unit, trusted, about)
     sharp = offset.value.detach().abs() < 1
     variance = params.temperature * offset.variance
     rho = surface + offset.value.clamp(-1, 1) * unit

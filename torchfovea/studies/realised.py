@@ -17,9 +17,10 @@ from torchfovea.sensing.correspondence import Budget, Correspondences
 from torchfovea.sensing.head import Eyes
 from torchfovea.sensing.triangulation import observe
 from torchfovea.sensing.unscented import SigmaPoints
-from torchfovea.stereo.matchers import Matcher, match_eyes
+from torchfovea.stereo.matchers import Matcher
 from torchfovea.stereo.rig import verged
 from torchfovea.stereo.sgbm import SGBM
+from torchfovea.stereo.views import verged_views
 from torchfovea.studies.characterization import PlaneSensor, correspond_plane, solid_angle_sr, straight_eyes
 from torchfovea.studies.plane import draw_plane
 
@@ -126,7 +127,7 @@ def look_at_plane(
     budget = replace(sensor.budget, source_px=size_px)
     rig = verged(vergence_rad, sensor.baseline_m)
     near = (matcher or Matcher(SGBM()))._replace(nearest_m=0.7 * distance_m)
-    matches, _ = match_eyes(near, left, right, rig, camera, retina, budget)
+    matches, _ = near(verged_views(left, right, rig, camera, retina.radius_px), retina, budget)
     px = retina.centers_px(dtype=left.dtype)
     true, points = correspond_plane(replace(sensor, budget=budget), px, pose, distance_m)
     rho, sigma, valid = _inverse_range(sensor, matches, pose, px)

@@ -1,0 +1,244 @@
+"""Two images with their cameras, how these stand, and where retinas look: what every matcher is given, checked once.
+
+Cameras are in image pixels here, whose centres are integers, for a pair of images is one without any retina too. A
+retina spans the images' shorter side about the gaze, so that `Views.cameras` knows them in its pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchfovea.sensing.camera import Camera, Pinhole
+from torchfovea.sensing.correspondence import Budget
+from torchfovea.sensing.retina import Retina, fovea
+from torchfovea.setting import require
+from torchfovea.stereo.rig import StereoRig
+
+__all__ = ["Views", "grey_of", "posed_views", "rectified_views", "verged_views"]
+
+GREY = (0.299, 0.587, 0.114)  # ITU-R BT.601, as OpenCV's
+
+
+class Views(NamedTuple):
+    """Two images of one moment; made by `verged_views`, `rectified_views` or `posed_views`, which check them.
+
+    Attributes:
+        left: (1 or 3, H, W), floating point in [0, 1]; or a batch (B, 1 or 3, H, W), for matchers that take one.
+        right: of the same height, width, type and device.
+        camera_left: in image pixels.
+        camera_right: in image pixels.
+        rig: how the cameras stand; its rotations may be a batch (B, 3, 3), too.
+        gaze_px: image pixel (column, row) that the retinas look at, in both images.
+        rectified: whether the images are rectified views as they are: no rotation, and pinholes that differ in cx
+            alone, so that matchers need not resample them.
+    """
+
+    left: Tensor
+    right: Tensor
+    camera_left: Camera
+    camera_right: Camera
+    rig: StereoRig
+    gaze_px: tuple[float, float]
+    rectified: bool = False
+
+    @property
+    def source_px(self) -> int:
+        """The images' shorter side [px], which a retina spans."""
+        return min(self.left.shape[-2:])
+
+    @property
+    def doffs_px(self) -> float:
+        """Disparity of a point at infinity in rectified images, negated: cx_right − cx_left; else 0 [px]."""
+        return self.camera_right.cx_px - self.camera_left.cx_px if self.rectified else 0.0
+
+    def scale(self, retina: Retina | None) -> float:
+        """Image pixels per retinal pixel; 1 without a retina, whose receptive fields (RFs) are the pixels then."""
+        return 1.0 if retina is None else self.source_px / (2 * retina.radius_px)
+
+    def origin_px(self, retina: Retina | None) -> tuple[float, float]:
+        """The image pixel where retinal coordinates are 0: the gaze; without a retina the first pixel."""
+        return (0.0, 0.0) if retina is None else self.gaze_px
+
+    def cameras(self, retina: Retina | None) -> tuple[Camera, Camera]:
+        """Both cameras in retinal pixels, those of the correspondences."""
+        scale, (u, v) = self.scale(retina), self.origin_px(retina)
+        left, right = (
+            replace(c, focal_px=c.focal_px / scale, cx_px=(c.cx_px - u) / scale, cy_px=(c.cy_px - v) / scale)
+            for c in (self.camera_left, self.camera_right)
+        )
+        return left, right
+
+    def holds(self, px: Tensor, retina: Retina | None, slack_px: float = 0.0) -> Tensor:
+        """Whether places (..., 2) [retinal px] lie on the images, or so many image pixels beyond; bool (...)."""
+        place = px * self.scale(retina) + px.new_tensor(self.origin_px(retina))
+        height, width = self.left.shape[-2:]
+        low, high = -0.5 - slack_px, place.new_tensor([width - 0.5 + slack_px, height - 0.5 + slack_px])
+        return ((place >= low) & (place <= high)).all(-1)
+
+    def told(self, budget: Budget | None) -> Budget:
+        """The error budget (the default for None) that knows the images' size, unless it leaves the source out."""
+        budget = budget or Budget()
+        return budget if budget.source_px is None else replace(budget, source_px=self.source_px)
+
+    def grey(self) -> Tensor:
+        """Both in grey, (2, 1, H, W), or (2B, 1, H, W) with all left ones first. Differentiable."""
+        greys = [grey_of(image) for image in (self.left, self.right)]
+        return torch.cat([grey if grey.dim() == 4 else grey[None] for grey in greys])
+
+    def colour(self) -> Tensor:
+        """Both in colour, (2, 3, H, W), of single images. Differentiable."""
+        return torch.stack([image.expand(3, -1, -1) for image in (self.left, self.right)])
+
+    def fovea(self, images: Tensor, retina: Retina) -> Tensor:
+        """What the retina sees of images (B, C, H, W) of this size, (B, C, N). Differentiable."""
+        gaze = None if self.gaze_px == _middle(images) else images.new_tensor([self.gaze_px] * len(images))
+        return fovea(images, gaze, retina, self.scale(retina))
+
+
+def grey_of(image: Tensor) -> Tensor:
+    """Images (..., 1 or 3, H, W) in grey, (..., 1, H, W). Differentiable."""
+    weights = image.new_tensor(GREY if image.shape[-3] == 3 else (1.0,))
+    return (weights[:, None, None] * image).sum(-3, keepdim=True)
+
+
+def verged_views(
+    left: Tensor | np.ndarray,
+    right: Tensor | np.ndarray,
+    rig: StereoRig,
+    camera: Camera,
+    radius_px: float,
+    camera_right: Camera | None = None,
+) -> Views:
+    """The images of two eyes, whose retinas look at their middles and span their shorter side.
+
+    Args:
+        left: (1 or 3, H, W) in [0, 1], or uint8; or a batch (B, 1 or 3, H, W).
+        right: the same size.
+        rig: the eyes' poses (`torchfovea.stereo.rig`); a batch may have (B, 3, 3) rotations.
+        camera: the left eye's, or both eyes', in retinal pixels.
+        radius_px: of the retinas.
+        camera_right: the right eye's, if it differs.
+
+    Raises:
+        SettingError: for images that are not finite, not of one size or out of [0, 1], and what is no camera or rig.
+    """
+    images = _images(left, right)
+    require(0 < radius_px < math.inf, "radius_px", radius_px, "a positive number of retinal pixels")
+    size, (u, v) = min(images[0].shape[-2:]), _middle(images[0])
+    cameras = []
+    for name, eye in (("camera", camera), ("camera_right", camera_right or camera)):
+        _check_camera(name, eye)
+        scale = size / (2 * radius_px)
+        focal = eye.focal_px * size / (2 * radius_px)
+        cameras.append(replace(eye, focal_px=focal, cx_px=u + eye.cx_px * scale, cy_px=v + eye.cy_px * scale))
+    _check_rig(rig, images[0])
+    return Views(*images, cameras[0], cameras[1], rig, (u, v))
+
+
+def rectified_views(
+    left: Tensor | np.ndarray,
+    right: Tensor | np.ndarray,
+    camera_left: Pinhole,
+    camera_right: Pinhole,
+    baseline_m: float,
+    gaze_px: tuple[float, float] | None = None,
+) -> Views:
+    """A pair that is already rectified.
+
+    Args:
+        left: (1 or 3, H, W) in [0, 1], or uint8.
+        right: the same size.
+        camera_left: in image pixels.
+        camera_right: in image pixels; the same focal length and cy.
+        baseline_m: distance between the cameras.
+        gaze_px: (column, row) that the retinas look at; None for the images' middle.
+
+    Raises:
+        SettingError: as `verged_views`, and for cameras that are not rectified.
+    """
+    for name, camera in (("camera_left", camera_left), ("camera_right", camera_right)):
+        require(isinstance(camera, Pinhole), name, camera, "a Pinhole in image pixels")
+    same = (camera_left.focal_px, camera_left.cy_px) == (camera_right.focal_px, camera_right.cy_px)
+    require(same, "camera_right", camera_right, f"focal_px and cy_px of the left camera, {camera_left}")
+    eye = torch.eye(3, dtype=torch.float64)
+    views = posed_views(left, right, camera_left, camera_right, StereoRig(eye, eye, baseline_m), gaze_px)
+    return views._replace(rectified=True)
+
+
+def posed_views(
+    left: Tensor | np.ndarray,
+    right: Tensor | np.ndarray,
+    camera_left: Camera,
+    camera_right: Camera,
+    rig: StereoRig,
+    gaze_px: tuple[float, float] | None = None,
+) -> Views:
+    """The images of any calibrated pair.
+
+    Args:
+        left: (1 or 3, H, W) in [0, 1], or uint8; or a batch (B, 1 or 3, H, W).
+        right: the same size.
+        camera_left: in image pixels.
+        camera_right: in image pixels.
+        rig: how they stand (`torchfovea.stereo.rig.posed`).
+        gaze_px: (column, row) that the retinas look at in both; None for the images' middle.
+
+    Raises:
+        SettingError: as `verged_views`.
+    """
+    images = _images(left, right)
+    _check_camera("camera_left", camera_left)
+    _check_camera("camera_right", camera_right)
+    _check_rig(rig, images[0])
+    u, v = _middle(images[0]) if gaze_px is None else gaze_px
+    require(math.isfinite(u) and math.isfinite(v), "gaze_px", gaze_px, "finite pixels")
+    return Views(*images, camera_left, camera_right, rig, (float(u), float(v)))
+
+
+def _images(left: Tensor | np.ndarray, right: Tensor | np.ndarray) -> tuple[Tensor, Tensor]:
+    """Both as floating-point tensors of one type; checked."""
+    one, other = (_image(name, image) for name, image in (("left", left), ("right", right)))
+    shapes = [(*image.shape[:-3], *image.shape[-2:]) for image in (one, other)]
+    expected = f"height and width {tuple(one.shape[-2:])}, as the left image"
+    require(shapes[0] == shapes[1], "right.shape", tuple(other.shape), expected)
+    return one, other.to(one)
+
+
+def _image(name: str, image: Tensor | np.ndarray) -> Tensor:
+    pixels = torch.as_tensor(image)
+    shape = tuple(pixels.shape)
+    fits = len(shape) in (3, 4) and shape[-3] in (1, 3)
+    require(fits, f"{name}.shape", shape, "(3, H, W) or (1, H, W), or a batch of such")
+    require(min(shape) >= 1, f"{name}.shape", shape, "at least one pixel")
+    if pixels.dtype == torch.uint8:
+        pixels = pixels.to(torch.get_default_dtype()) / 255
+    require(pixels.is_floating_point(), f"{name}.dtype", pixels.dtype, "floating point in [0, 1], or uint8")
+    low, high = (float(end) for end in pixels.detach().aminmax())  # NaN if there is any
+    require(math.isfinite(low) and math.isfinite(high), name, "NaN or infinite values", "finite values")
+    require(low >= -1e-3 and high <= 1 + 1e-3, name, f"{low:g} to {high:g}", "values in [0, 1]")
+    return pixels
+
+
+def _check_camera(name: str, camera: Camera) -> None:
+    require(isinstance(camera, Camera), name, camera, "a Pinhole or a Fisheye")
+
+
+def _check_rig(rig: StereoRig, image: Tensor) -> None:
+    """Raise SettingError unless the rig is of one pair, or of as many as there are images."""
+    require(isinstance(rig, StereoRig), "rig", type(rig).__name__, "a StereoRig (verged, posed)")
+    shapes = [(3, 3)] if image.dim() == 3 else [(3, 3), (len(image), 3, 3)]
+    for name in ("R_left", "R_right"):
+        shape = tuple(getattr(rig, name).shape)
+        require(shape in shapes, f"rig.{name}.shape", shape, " or ".join(map(str, shapes)))
+    require(0 < rig.baseline_m < math.inf, "baseline_m", rig.baseline_m, "a positive distance in metres")
+
+
+def _middle(image: Tensor) -> tuple[float, float]:
+    height, width = image.shape[-2:]
+    return (width - 1) / 2, (height - 1) / 2
