@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchfovea.gaussian import columns
-from torchfovea.memory.egosphere import Fusion, Prior, belief, new_egosphere, trust
-from torchfovea.memory.nearest import build_index, neighbour_spacing_rad
+from torchfovea.memory.egosphere import Fusion, Prior, belief, empty_memory, trust
 from torchfovea.memory.pooling import pool_patches, share_errors
 from torchfovea.memory.update import fuse, remember
 from torchfovea.memory.voting import Sight, against, cast
@@ -34,9 +33,9 @@ def look(rho: float, inlier: float = 1.0, fields: int = 9, sigma: float = 0.01) 
 
 
 def after(*looks: Observations, kin: Kinship | None = None):
-    memory, index, spacing = new_egosphere(AHEAD, PRIOR), build_index(AHEAD), neighbour_spacing_rad(AHEAD)
+    memory = empty_memory(AHEAD, PRIOR)
     for seen in looks:
-        memory = remember(memory, index, spacing, seen, FUSION, PRIOR, None, kin)
+        memory = remember(memory, seen, FUSION, None, kin)
     return memory
 
 
@@ -112,7 +111,7 @@ def test_votes_are_counted_as_in_a_loop(seed):
 
 
 def test_what_no_one_doubts_is_believed_and_what_is_unseen_is_not():
-    memory = new_egosphere(AHEAD, PRIOR)
+    memory = empty_memory(AHEAD, PRIOR)
     assert trust(memory).item() == 0
     for rho in (0.01, 0.5, 3.0):
         assert trust(after(look(rho))).item() == 1
@@ -151,7 +150,7 @@ def test_what_fields_share_does_not_average_out(fields, patches):
     error = correlation**0.5 * common + (1 - correlation) ** 0.5 * own
     ones = torch.ones(fields, dtype=torch.float64)
     row = columns(0 * ones, 0 * ones, ones)
-    pooled = pool_patches(ones, 0.04 * ones, ones, row, ones, torch.zeros(fields, dtype=torch.int64), ONE, 1)
+    pooled = pool_patches(ones, 0.04 * ones, ones, row, ones, torch.zeros(fields, dtype=torch.int64), (1,))
     told, share = share_errors(pooled, torch.tensor([patches], dtype=torch.float64), shared, 0.3)
     claimed = 1 / told.information.matrix[0, 5].item()
     assert 0.04 * error.mean(1).var().item() == pytest.approx(claimed, rel=0.03)
@@ -166,11 +165,11 @@ def test_what_lasts_between_looks_stays():
     error = lasting + torch.randn(runs, 4, generator=rng, dtype=torch.float64) * (u - part).sqrt()
     weight = 1 / u
     actual = ((error * weight).sum(1) / weight.sum()).var().item()
-    memory = new_egosphere(AHEAD, Prior(mean=0.5, std=50.0))
+    memory = empty_memory(AHEAD, Prior(mean=0.5, std=50.0))
     for one, lasts in zip(u, part, strict=True):
         ones = torch.ones(1, dtype=torch.float64)
         row = columns(0 * ones, 0 * ones, ones)
-        pooled = pool_patches(0.5 * ones, one * ones, ones, row, ones, torch.zeros(1, dtype=torch.int64), ONE, 1)
+        pooled = pool_patches(0.5 * ones, one * ones, ones, row, ones, torch.zeros(1, dtype=torch.int64), (1,))
         memory = fuse(memory, pooled, columns(lasts.sqrt() / one, lasts / one**2)[None])
     assert belief(memory).cov[0, 5].item() == pytest.approx(actual, rel=0.03)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -17,7 +19,7 @@ class Pooled(NamedTuple):
 
     Attributes:
         information: (..., Nx, 3) and (..., Nx, 6), zero where nothing came.
-        bearing: see `EgoSphere`, (..., Nx).
+        bearing: see `Memory`, (..., Nx).
         hits: number of observations (..., Nx).
     """
 
@@ -26,30 +28,29 @@ class Pooled(NamedTuple):
     hits: Tensor
 
 
-def _sum_up(parts: list[Tensor], cell: Tensor, batch: torch.Size, cells: int) -> Pooled:
+def _sum_up(parts: list[Tensor], cell: Tensor, shape: Sequence[int]) -> Pooled:
     """Add up ten or eleven components (M,): vector, matrix, perhaps bearing, count."""
     rows = torch.stack(parts)
-    total = torch.zeros(len(parts), batch.numel() * cells, dtype=rows.dtype, device=rows.device)
+    total = torch.zeros(len(parts), math.prod(shape), dtype=rows.dtype, device=rows.device)
     total = total.scatter_add(1, cell.expand(len(parts), -1), rows)
-    total = total.reshape(len(parts), *batch, cells).movedim(0, -1)
+    total = total.reshape(len(parts), *shape).movedim(0, -1)
     bearing = total[..., 9] if len(parts) == 11 else torch.zeros_like(total[..., 9])
     return Pooled(Information(total[..., :3], total[..., 3:9]), bearing, total[..., -1])
 
 
-def pool(gaussian: Gaussian, cell: Tensor, batch: torch.Size, cells: int) -> Pooled:
+def pool(gaussian: Gaussian, cell: Tensor, shape: Sequence[int]) -> Pooled:
     """Add up the information of one saccade's points, cell by cell (Eq. 34-35 without the memory).
 
     Args:
         gaussian: (M, 3) and (M, 6), points in E.
         cell: (M,) int64, counted through all batches.
-        batch: leading axes of the memory.
-        cells: Nx.
+        shape: of the memory, (..., Nx).
 
     Differentiable in the Gaussians.
     """
     vector, matrix = information_from_gaussian(gaussian)
     parts = [*vector.unbind(-1), *matrix.unbind(-1), torch.ones_like(vector[..., 0])]
-    return _sum_up(parts, cell, batch, cells)
+    return _sum_up(parts, cell, shape)
 
 
 def pool_patches(
@@ -59,8 +60,7 @@ def pool_patches(
     row: Tensor,
     keep: Tensor,
     cell: Tensor,
-    batch: torch.Size,
-    cells: int,
+    shape: Sequence[int],
 ) -> Pooled:
     """Add up the information of one saccade's inverse ranges about the patches that they fall on.
 
@@ -71,8 +71,7 @@ def pool_patches(
         row: their directions in their cells' frames (e₁, e₂, p), (M, 3).
         keep: how often each counts, 1 or 0, (M,).
         cell: (M,) int64, counted through all batches.
-        batch: leading axes of the memory.
-        cells: Nx.
+        shape: of the memory, (..., Nx).
 
     Differentiable in all but the cells.
     """
@@ -80,7 +79,7 @@ def pool_patches(
     weight = keep / variance
     wx, wy, wz = weight * x, weight * y, weight * z
     parts = [wx * rho, wy * rho, wz * rho, wx * x, wx * y, wx * z, wy * y, wy * z, wz * z, keep * bearing]
-    return _sum_up([*parts, keep], cell, batch, cells)
+    return _sum_up([*parts, keep], cell, shape)
 
 
 def share_errors(pooled: Pooled, patches: Tensor, shared: float, lasting: Tensor | float) -> tuple[Pooled, Tensor]:
