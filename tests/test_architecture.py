@@ -53,6 +53,7 @@ FLOORS = (
         "rig",
         "rectified",
         "matching",
+        "fields",
         "geometric",
         "triangulation",
         "association",

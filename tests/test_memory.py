@@ -12,8 +12,10 @@ from torchfovea.memory.nearest import build_index, index_of_set, nearest_cell
 from torchfovea.memory.sphere import fibonacci_directions, latitude_longitude_directions
 from torchfovea.memory.update import remember
 from torchfovea.perception import Observer, decide, new_memory, perceive
-from torchfovea.sensing.correspondence import Correspondences
-from torchfovea.sensing.head import Gaze, eyes
+from torchfovea.sensing.correspondence import Budget, Correspondences
+from torchfovea.sensing.fields import draw_fields, for_all
+from torchfovea.sensing.geometric import correspond_points
+from torchfovea.sensing.head import Gaze, eyes, to_ego
 from torchfovea.sensing.layout import LogPolar
 from torchfovea.sensing.triangulation import observe
 from torchfovea.setting import SettingError
@@ -112,3 +114,36 @@ def test_rows_of_a_batch_go_on_by_themselves():
 def test_memories_that_are_no_batch_are_refused(other, message):
     with pytest.raises(SettingError, match=message):
         stack([empty_memory(CELLS, Prior()), other])
+
+
+@pytest.mark.parametrize("observer", [PATCHES, POINTS], ids=["patches", "points"])
+@pytest.mark.parametrize("sample", [None, 120])
+def test_leaving_out_what_is_not_valid_changes_nothing(observer, sample):
+    observer = dataclasses.replace(observer, retina=LogPolar(600), budget=Budget(shared=0.5, lasting=0.2))
+    cells, rng = fibonacci_directions(2000, torch.float64), torch.Generator().manual_seed(0)
+    chosen = draw_fields(observer.retina.count, sample, rng)
+    px = observer.retina.centers_px(dtype=torch.float64)
+    px = px if chosen is None else px[chosen]
+    visible = torch.rand(len(px), generator=rng) < 0.6
+    pose = eyes(observer.head, Gaze(*torch.tensor([0.1, -0.2, 0.15], dtype=torch.float64)))
+    points = pose.t_left + 1.5 * to_ego(pose.R_left, observer.camera.rays(px))
+    matches = correspond_points(points, visible, px, pose, observer.camera, observer.retina, observer.budget, None)
+    matches = matches if chosen is None else for_all(matches, observer.retina)
+    masked, dropped = (
+        perceive(observer, new_memory(observer, cells), part, pose) for part in (matches, matches.take(matches.valid))
+    )
+    assert int((masked.looks > 0).sum()) > 100
+    assert torch.equal(masked.looks, dropped.looks)
+    for one, other in zip(masked.information, dropped.information, strict=True):
+        torch.testing.assert_close(one, other)
+
+
+def test_fields_that_stand_for_all_cover_as_much_as_all():
+    retina = LogPolar(600)
+    px = retina.centers_px(dtype=torch.float64)
+    sigma, valid = torch.ones_like(px[:, 0]), torch.ones(len(px), dtype=torch.bool)
+    every = Correspondences(px, px, sigma, sigma, valid)
+    area = (2 * for_all(every, retina).support_px).square().sum()
+    torch.testing.assert_close(area, retina.width_px(px).square().sum())
+    some = for_all(every.take(draw_fields(retina.count, 60, torch.Generator().manual_seed(0))), retina)
+    torch.testing.assert_close(some.support_px, retina.width_px(some.left_px) / 2 * (retina.count / 60) ** 0.5)

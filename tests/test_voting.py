@@ -191,7 +191,8 @@ def test_kinship_counts_fields_by_the_patches_they_cover():
     width = retina.width_px(px)
     length = torch.maximum(torch.full_like(width, 2.0), 2 * width)
     torch.testing.assert_close(kin.patch, width**2 / (2 * math.pi * length**2))
-    half = kinship(Budget(shared=0.5, shared_widths=2), retina, px, 0.5)
+    # of fields that stand for twice as many
+    half = kinship(Budget(shared=0.5, shared_widths=2), retina, px, retina.width_px(px) / math.sqrt(2))
     torch.testing.assert_close(half.patch, kin.patch * 2)
 
 

@@ -153,15 +153,14 @@ def perceive(
         common: what the receptive fields' errors share, see `torchfovea.memory.egosphere.remember`; by default what the
             head's encoders get wrong.
 
-    Differentiable in the correspondences. Where only some of the receptive fields were looked through, each stands for
-    as many more as are missing and covers a wider patch.
+    Differentiable in the correspondences. Leaving out those that are not valid changes nothing: what each stands for
+    it carries itself.
 
     Raises:
         SettingError: for a memory of another chart or prior than the observer's.
     """
     _check_owner(observer, memory)
-    share = observer.retina.count / max(1, matches.valid.shape[-1])
-    support = observer.retina.width_px(matches.left_px) / 2 * math.sqrt(max(1.0, share))
+    support = observer.retina.width_px(matches.left_px) / 2 if matches.support_px is None else matches.support_px
     observed = observe(
         matches, eyes, observer.camera, support, observer.points, observer.fusion.chart, observer.rotated
     )
@@ -169,7 +168,7 @@ def perceive(
     if common is None and sigma > 0:
         common = partial(encoder_covariance, eyes=eyes, sigma_rad=(sigma,) * 3, chart=observer.fusion.chart)
     axis = eyes.R_left[..., 2]
-    kin = kinship(observer.budget, observer.retina, matches.left_px, 1 / share)
+    kin = kinship(observer.budget, observer.retina, matches.left_px, matches.support_px)
     if kin is not None and memory.axis is not None:
         # what looks at one place from one gaze share is all that its fields share
         same = torch.exp(-(((axis - memory.axis).norm(dim=-1, keepdim=True) / math.radians(SAME_GAZE_DEG)).square()))

@@ -12,6 +12,7 @@ from torchfovea.gaussian import columns
 from torchfovea.memory.egosphere import Memory
 from torchfovea.perception import Observer, new_memory
 from torchfovea.sensing.correspondence import Correspondences
+from torchfovea.sensing.fields import for_all
 from torchfovea.sensing.geometric import correspond_points
 from torchfovea.sensing.head import Eyes, eyes, fixate, to_ego
 
@@ -60,7 +61,7 @@ def part_of(look: Saccade, count: int) -> Saccade:
     every = torch.linspace(0, look.matches.valid.shape[-1] - 1, count).long().to(look.matches.valid.device)
     kept = look.matches.take(every)
     left_px, right_px = (columns(*part.unbind(-1)) for part in kept[:2])
-    return look._replace(matches=kept._replace(left_px=left_px, right_px=right_px))
+    return look._replace(matches=for_all(kept._replace(left_px=left_px, right_px=right_px), look.observer.retina))
 
 
 def support_of(look: Saccade) -> Tensor:

@@ -38,6 +38,8 @@ class Correspondences(NamedTuple):
         valid: bool (..., N).
         inlier: (..., N), probability that the two places show one point at all, by what the matcher knows of this pair;
             None: certain.
+        support_px: (..., N), half the width that the left RF stands for [px]: its own, and more where only some of the
+            RFs were looked through; None: its own, by the retina.
     """
 
     left_px: Tensor
@@ -46,12 +48,13 @@ class Correspondences(NamedTuple):
     right_sigma_px: Tensor
     valid: Tensor
     inlier: Tensor | None = None
+    support_px: Tensor | None = None
 
     def take(self, index: int | Tensor) -> Correspondences:
         """Every part at an index of the first axis: some receptive fields (N,), or one row of a batch (B, N)."""
         left_px, right_px, left_sigma, right_sigma, valid = (part[index] for part in self[:5])
-        inlier = None if self.inlier is None else self.inlier[index]
-        return Correspondences(left_px, right_px, left_sigma, right_sigma, valid, inlier)
+        more = (None if part is None else part[index] for part in self[5:])
+        return Correspondences(left_px, right_px, left_sigma, right_sigma, valid, *more)
 
 
 class Disparity(NamedTuple):
@@ -236,7 +239,7 @@ def eye_sigma_px(budget: Budget, retina: Retina, px: Tensor, clues: Clues | None
     return square.sqrt()
 
 
-def kinship(budget: Budget, retina: Retina, px: Tensor, looked_through: float = 1.0) -> Kinship | None:
+def kinship(budget: Budget, retina: Retina, px: Tensor, support_px: Tensor | None = None) -> Kinship | None:
     """What the errors of receptive fields at places (..., N, 2) of a retina share, by a budget; None: nothing.
 
     Correlation falls off as exp(−distance/ℓ), ℓ = max(`shared_px` source pixels, `shared_widths` widths), so that a
@@ -246,14 +249,15 @@ def kinship(budget: Budget, retina: Retina, px: Tensor, looked_through: float = 
         budget: its terms `shared` and `lasting`.
         retina: the layout.
         px: where the receptive fields are [retinal px].
-        looked_through: the share of all receptive fields that these are.
+        support_px: see `Correspondences`, (..., N); the more a field stands for, the more of a patch it covers.
     """
     if budget.shared == 0:
         return None
     width = retina.width_px(px)
     source = 0.0 if budget.source_px is None else 2 * retina.radius_px / budget.source_px
     length = (budget.shared_widths * width).clamp(min=max(budget.shared_px * source, 1e-6))
-    patch = (width.square() / (2 * math.pi * looked_through * length.square())).clamp(max=1)
+    covered = width if support_px is None else 2 * support_px
+    patch = (covered.square() / (2 * math.pi * length.square())).clamp(max=1)
     return Kinship(patch, budget.shared, budget.lasting)
 
 

@@ -240,6 +240,7 @@ def correspondences(
     if retina is None:  # the RFs are the source's pixels
         square = torch.full_like(left_px[:, 0], budget.sigma_over_width**2 + budget.match_px**2)
         sigma = (square if clues is None else square + doubt(budget, clues)).sqrt()
-        return Correspondences(left_px, right_px, sigma, sigma, valid, inlier)
+        half = torch.full_like(left_px[:, 0], 0.5)
+        return Correspondences(left_px, right_px, sigma, sigma, valid, inlier, half)
     left_sigma, right_sigma = (eye_sigma_px(budget, retina, px, clues) for px in (left_px, right_px))
-    return Correspondences(left_px, right_px, left_sigma, right_sigma, valid, inlier)
+    return Correspondences(left_px, right_px, left_sigma, right_sigma, valid, inlier, retina.width_px(left_px) / 2)

@@ -166,6 +166,7 @@ def match_sweep(
         (eye_sigma_px(budget, retina, right_px, clues).square() + budget.claim**2 * match_px).sqrt(),
         valid,
         valid * inlier_share(budget, clues),
+        (retina.width_px(left_px) / 2).expand(batch, -1),
     )
     inverse_range, sigma, correlation = (
         torch.where(valid, x, zero) for x in (rho / length, sigma / length, correlation)
