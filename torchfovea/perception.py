@@ -45,7 +45,7 @@ from torchfovea.setting import require
 
 SAME_GAZE_DEG = 2.0  # looks nearer to each other than about this see the same pixels of the same surfaces
 
-__all__ = ["Eligibility", "Observer", "Step", "decide", "gaze_at", "new_memory", "perceive", "reward_of"]
+__all__ = ["Eligibility", "Observer", "Step", "check_owner", "decide", "gaze_at", "new_memory", "perceive", "reward_of"]
 
 
 @dataclass(frozen=True)
@@ -134,8 +134,12 @@ def new_memory(observer: Observer, cells: Tensor) -> Memory:
     return empty_memory(cells, observer.prior, observer.fusion.chart)
 
 
-def _check_owner(observer: Observer, memory: Memory) -> None:
-    """Refuse another observer's memory, whose numbers would mean something else."""
+def check_owner(observer: Observer, memory: Memory) -> None:
+    """Refuse another observer's memory, whose numbers would mean something else.
+
+    Raises:
+        SettingError: for a memory of another chart or prior than the observer's; it names both.
+    """
     check_chart(memory, observer.fusion.chart, "fusion.chart")
     require(observer.prior == memory.prior, "prior", observer.prior, f"{memory.prior}, the prior of the memory")
 
@@ -159,7 +163,7 @@ def perceive(
     Raises:
         SettingError: for a memory of another chart or prior than the observer's.
     """
-    _check_owner(observer, memory)
+    check_owner(observer, memory)
     support = observer.retina.width_px(matches.left_px) / 2 if matches.support_px is None else matches.support_px
     observed = observe(
         matches, eyes, observer.camera, support, observer.points, observer.fusion.chart, observer.rotated
@@ -259,7 +263,7 @@ def decide(
     Raises:
         SettingError: for a memory of another chart or prior than the observer's.
     """
-    _check_owner(observer, memory)
+    check_owner(observer, memory)
     points, reward = reward_of(observer, memory)
     seen = memory.looks > 0
     # the eyes meet where the surface is, or where an unseen one would be while it is more likely not there

@@ -15,6 +15,7 @@ from torchfovea.arena import Look, Truth, stack
 from torchfovea.deciding.strategies import Strategy
 from torchfovea.episode import Episode, run_episode, run_episodes
 from torchfovea.experiments.build import build_arena, build_cells, build_motor, build_scene_of, name_of
+from torchfovea.experiments.memories import loaded_memory
 from torchfovea.experiments.settings import choice, number, whole
 from torchfovea.experiments.strategy import build_stop, build_strategy
 from torchfovea.memory.egosphere import Memory
@@ -58,7 +59,9 @@ def one_episode(
     """The episode of one seed, with whatever sensor, renderer and motor."""
     generator = torch.Generator().manual_seed(seed)
     arena = build_arena(cfg, observer, seed)
-    memory = new_memory(observer, build_cells(_aimed(cfg, arena.world.scene), observer.head, generator))
+    memory = loaded_memory(cfg, observer)
+    if memory is None:
+        memory = new_memory(observer, build_cells(_aimed(cfg, arena.world.scene), observer.head, generator))
     truth = arena.truth(memory.cells)
     observer = dataclasses.replace(observer, acquisition=build_strategy(cfg, observer, _aim(truth)))
     return run_episode(
@@ -103,10 +106,12 @@ def _start(settings: str, observer: Observer, seed: int) -> tuple[Memory, Tensor
 def prepare(cfg: DictConfig, observer: Observer, seed: int) -> tuple[Scene, Memory, Truth, torch.Generator]:
     """What an episode starts from; scenes and memories are kept for the next call with the same settings."""
     scene = _scene(OmegaConf.to_yaml(OmegaConf.masked_copy(cfg, ["scene", "trust"]), resolve=True), observer.head, seed)
+    generator, memory = torch.Generator().manual_seed(seed), loaded_memory(cfg, observer)
+    if memory is not None:
+        return scene, memory, truth_of(scene, memory.cells), generator
     plain = dataclasses.replace(observer, acquisition=Observer().acquisition)
     cells = OmegaConf.masked_copy(_aimed(cfg, scene), ["memory"])
     memory, state = _start(OmegaConf.to_yaml(cells, resolve=True), plain, seed)
-    generator = torch.Generator()
     generator.set_state(state)
     return scene, memory, truth_of(scene, memory.cells), generator
 
