@@ -37,6 +37,7 @@ FLOORS = (
     ("topology", "sphere", "cell_index", "nearest"),
     (
         "correspondence",
+        "kinship",
         "visibility",
         "confidence",
         "sgbm",
@@ -55,6 +56,7 @@ FLOORS = (
         "rectification",
         "maps",
         "matching",
+        "fields",
         "geometric",
         "triangulation",
         "association",

@@ -16,7 +16,8 @@ from torchfovea.config import conf_dir
 from torchfovea.experiments.budgets import build_budget, made_for, shipped, write_budget
 from torchfovea.experiments.pairs import load_folder, named_pair
 from torchfovea.experiments.regions import REGIONS, hidden_places, regions, truth_step_px
-from torchfovea.sensing.correspondence import Budget, Clues, doubt, inlier_share, once_a_pixel
+from torchfovea.sensing.correspondence import Budget, Clues, doubt, inlier_share
+from torchfovea.sensing.kinship import once_a_pixel
 from torchfovea.setting import SettingError
 from torchfovea.studies.calibration import sigma_of
 from torchfovea.studies.shared_errors import Sight, lasting_share, shared_share

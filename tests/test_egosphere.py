@@ -9,6 +9,7 @@ from filterpy.kalman import KalmanFilter
 from hypothesis import given
 from hypothesis import strategies as st
 
+from torchfovea.arena import row, stack
 from torchfovea.gaussian import Gaussian, columns, inverse3, pack, positive_definite, unpack
 from torchfovea.memory.association import associate, in_front
 from torchfovea.memory.egosphere import (
@@ -16,10 +17,11 @@ from torchfovea.memory.egosphere import (
     Prior,
     belief,
     cartesian_belief,
+    empty_memory,
     forget,
-    new_egosphere,
+    prior_information,
 )
-from torchfovea.memory.nearest import build_index, neighbour_spacing_rad
+from torchfovea.memory.nearest import build_index
 from torchfovea.memory.pooling import add_common, nearness, pool, pool_patches
 from torchfovea.memory.sphere import fibonacci_directions
 from torchfovea.memory.update import fuse, remember
@@ -27,7 +29,6 @@ from torchfovea.sensing.chart import basis, cartesian_from_inverse_range
 from torchfovea.sensing.triangulation import Observations
 from torchfovea.setting import SettingError
 
-ONE = torch.Size([])
 AHEAD = torch.tensor([[1.0, 0, 0]], dtype=torch.float64)
 
 
@@ -38,11 +39,13 @@ def gaussians(count: int, seed: int, dtype=torch.float64) -> Gaussian:
     return Gaussian(mean.to(dtype), pack(root @ root.mT + 0.01 * torch.eye(3, dtype=torch.float64)).to(dtype))
 
 
-def observed_at(direction: torch.Tensor, gaussian: Gaussian, support: float = 0.01) -> Observations:
+def observed_at(
+    direction: torch.Tensor, gaussian: Gaussian, support: float = 0.01, chart: str = "inverse_range"
+) -> Observations:
     shape = direction.shape[:-1]
     support_rad = torch.full(shape, support, dtype=direction.dtype)
     valid = torch.ones(shape, dtype=torch.bool)
-    return Observations(gaussian.mean, gaussian.cov, direction, support_rad, valid, valid.to(direction))
+    return Observations(gaussian.mean, gaussian.cov, direction, support_rad, valid, valid.to(direction), chart)
 
 
 def nearnesses(rho: torch.Tensor, std: float, bearing_std: float = 1e-3) -> Gaussian:
@@ -58,22 +61,22 @@ def around(cell: torch.Tensor, angle: float, count: int, seed: int) -> torch.Ten
 
 
 def enter(cells, observed, fusion, prior=None, times=1, common=None):
-    """A new memory after some equal saccades."""
+    """A new memory after some equal saccades, the observations being of its chart."""
+    observed = observed._replace(chart=fusion.chart)
     prior = prior or Prior()
-    memory = new_egosphere(cells, prior, fusion.chart)
-    index, spacing = build_index(cells), neighbour_spacing_rad(cells)
+    memory = empty_memory(cells, prior, fusion.chart)
     for _ in range(times):
-        memory = remember(memory, index, spacing, observed, fusion, prior, common)
+        memory = remember(memory, observed, fusion, common)
     return memory
 
 
 @given(seed=st.integers(0, 1000))
 def test_points_fuse_as_in_a_kalman_filter_one_observation_at_a_time(seed):
     cells = fibonacci_directions(4, torch.float64)
-    memory = new_egosphere(cells, Prior(mean=2.0, std=3.0), "cartesian")
+    memory = empty_memory(cells, Prior(mean=2.0, std=3.0), "cartesian")
     found = gaussians(12, seed)
     cell = torch.randint(0, 3, (12,), generator=torch.Generator().manual_seed(seed))
-    after = fuse(memory, pool(found, cell, ONE, 4))
+    after = fuse(memory, pool(found, cell, (4,)))
     got = belief(after)
     for i in range(4):
         peer = KalmanFilter(3, 3)
@@ -108,7 +111,7 @@ def test_inverse_ranges_fuse_as_in_a_kalman_filter_of_the_patch(seed):
 @given(seed=st.integers(0, 1000))
 def test_nearness_is_the_marginal_of_the_whole_patch(seed):
     found = gaussians(5, seed)
-    information = type(new_egosphere(AHEAD, Prior()).information)(found.mean, found.cov)
+    information = type(empty_memory(AHEAD, Prior()).information)(found.mean, found.cov)
     mean, variance = nearness(information)
     cov = inverse3(found.cov)
     torch.testing.assert_close(variance, cov[:, 5])
@@ -118,20 +121,20 @@ def test_nearness_is_the_marginal_of_the_whole_patch(seed):
 def test_order_does_not_matter_and_unseen_cells_stay():
     found, cell = gaussians(50, 1), torch.arange(50) % 7
     turned = torch.randperm(50, generator=torch.Generator().manual_seed(0))
-    one = pool(found, cell, ONE, 9)
-    two = pool(Gaussian(found.mean[turned], found.cov[turned]), cell[turned], ONE, 9)
+    one = pool(found, cell, (9,))
+    two = pool(Gaussian(found.mean[turned], found.cov[turned]), cell[turned], (9,))
     torch.testing.assert_close(one.information.matrix, two.information.matrix)
-    memory = new_egosphere(fibonacci_directions(9, torch.float64), Prior(), "cartesian")
+    memory = empty_memory(fibonacci_directions(9, torch.float64), Prior(), "cartesian")
     after = fuse(memory, one)
     assert torch.equal(after.information.matrix[7:], memory.information.matrix[7:])
 
 
 def test_common_covariance_is_a_floor_that_no_averaging_removes():
     """1,000 observations that share an error of 1 cm stay 1 cm uncertain; without the term they claim 0.3 mm."""
-    memory = new_egosphere(AHEAD, Prior(mean=2.0, std=100.0), "cartesian")
+    memory = empty_memory(AHEAD, Prior(mean=2.0, std=100.0), "cartesian")
     single = pack(1e-4 * torch.eye(3, dtype=torch.float64))
     found = Gaussian(torch.tensor([[2.0, 0, 0]], dtype=torch.float64).expand(1000, 3), single.expand(1000, 6))
-    pooled = pool(found, torch.zeros(1000, dtype=torch.long), ONE, 1)
+    pooled = pool(found, torch.zeros(1000, dtype=torch.long), (1,))
     with_common = belief(fuse(memory, add_common(pooled, single[None], "cartesian")))
     without = belief(fuse(memory, pooled))
     assert with_common.cov[0, 0].sqrt().item() == pytest.approx(0.01, rel=0.01)
@@ -143,7 +146,7 @@ def test_common_covariance_of_patches_is_added_to_the_pooled_moments():
     row = torch.nn.functional.normalize(torch.randn(8, 3, generator=rng, dtype=torch.float64), dim=-1)
     ones = torch.ones(8, dtype=torch.float64)
     zero = torch.zeros(8, dtype=torch.long)
-    pooled = pool_patches(0.5 * ones, 0.01 * ones, 100 * ones, row, ones, zero, ONE, 1)
+    pooled = pool_patches(0.5 * ones, 0.01 * ones, 100 * ones, row, ones, zero, (1,))
     common = torch.tensor([[1e-4, 0, 0, 3e-4, 0, 2e-3]], dtype=torch.float64)
     after = add_common(pooled, common, "inverse_range", slope_std=2.0)
     before = unpack(inverse3(pooled.information.matrix))
@@ -153,7 +156,7 @@ def test_common_covariance_of_patches_is_added_to_the_pooled_moments():
     torch.testing.assert_close(mean[0], mean[1])
     torch.testing.assert_close(1 / after.bearing, 1 / pooled.bearing + 2e-4)
     # where nothing came there is nothing to add to
-    empty = pool_patches(*(x[:0] for x in (ones, ones, ones, row, ones, zero)), ONE, 1)
+    empty = pool_patches(*(x[:0] for x in (ones, ones, ones, row, ones, zero)), (1,))
     assert add_common(empty, common, "inverse_range").information.matrix.abs().sum() == 0
 
 
@@ -184,7 +187,7 @@ def test_batches_of_memories_are_loops():
     for fusion in (Fusion(fill=False), Fusion(), Fusion("aligned")):
         whole = enter(cells, seen, fusion)
         for b in range(2):
-            one = enter(cells[b], Observations(*(x[b] for x in seen)), fusion)
+            one = enter(cells[b], row(seen, b), fusion)
             for a, c in zip(whole.information, one.information, strict=True):
                 torch.testing.assert_close(a[b], c)
             assert torch.equal(whole.looks[b], one.looks)
@@ -202,7 +205,7 @@ def test_rays_of_one_cell_do_not_pull_it_to_the_eye_unless_printed(name, low, hi
     gaussian = inverse if name == "inverse_range" else cartesian_from_inverse_range(inverse, direction)
     prior = Prior(0.3, 1.0) if name == "inverse_range" else Prior(1000.0, 1000.0)
     memory = enter(AHEAD, observed_at(direction, gaussian), fusion, prior)
-    ratio = cartesian_belief(memory, fusion.chart).mean.norm().item() / 2
+    ratio = cartesian_belief(memory).mean.norm().item() / 2
     assert low < ratio < high, ratio
 
 
@@ -229,11 +232,10 @@ def test_what_a_nearer_surface_hides_is_left_out_whatever_comes_first():
 
     def rho(*masks):
         fusion = Fusion(gate_deg=5)
-        memory = new_egosphere(AHEAD, Prior())
-        index, spacing = build_index(AHEAD), neighbour_spacing_rad(AHEAD)
+        memory = empty_memory(AHEAD, Prior())
         for mask in masks:
             seen = observed_at(direction, both)._replace(valid=mask)
-            memory = remember(memory, index, spacing, seen, fusion, Prior())
+            memory = remember(memory, seen, fusion)
         return belief(memory).mean[0, 2].item()
 
     every = torch.ones_like(near)
@@ -269,13 +271,13 @@ def gate_case():
 
 def test_gate_and_fill():
     cells, direction, gaussian = gate_case()
-    index, spacing = build_index(cells), torch.full((4,), 0.01, dtype=torch.float64)
+    spacing = torch.full((4,), 0.01, dtype=torch.float64)
 
     def looks(support, valid=True, **options):
         seen = observed_at(direction, gaussian, support)
         seen = seen._replace(valid=seen.valid & valid)
-        memory = new_egosphere(cells, Prior())
-        after = remember(memory, index, spacing, seen, Fusion(**options), Prior())
+        memory = empty_memory(cells, Prior())._replace(spacing_rad=spacing)
+        after = remember(memory, seen, Fusion(**options))
         if not valid:
             assert torch.equal(after.information.matrix, memory.information.matrix)
         return after.looks.tolist()
@@ -288,7 +290,7 @@ def test_gate_and_fill():
 
 def test_pairs_count_through_the_batches():
     cells, direction, gaussian = gate_case()
-    two = Observations(*(torch.stack([x, x]) for x in observed_at(direction, gaussian, 0.1)))
+    two = stack([observed_at(direction, gaussian, 0.1)] * 2)
     both = torch.stack([cells, cells.roll(1, 0)])
     spacing = torch.full((2, 4), 0.01, dtype=torch.float64)
     pairs = associate(both, build_index(both), spacing, two, 0.02, 2.0, True)
@@ -338,11 +340,11 @@ def test_a_million_fusions_in_float32_stay_positive_and_near_float64():
     for dtype in (torch.float32, torch.float64):
         x, ahead = ones.to(dtype), AHEAD.to(dtype)
         pooled = {
-            "cartesian": pool(Gaussian(*(part.to(dtype) for part in found)), cell, ONE, 1),
-            "inverse_range": pool_patches(0.7 * x, 1e-3 * x, 1e4 * x, row.to(dtype), x, cell, ONE, 1),
+            "cartesian": pool(Gaussian(*(part.to(dtype) for part in found)), cell, (1,)),
+            "inverse_range": pool_patches(0.7 * x, 1e-3 * x, 1e4 * x, row.to(dtype), x, cell, (1,)),
         }
         for chart, got in results.items():
-            memory = new_egosphere(ahead, Prior(), chart)
+            memory = empty_memory(ahead, Prior(), chart)
             for _ in range(1000):
                 memory = fuse(memory, pooled[chart])
             got.append(belief(memory))
@@ -361,17 +363,16 @@ def test_forgetting_halves_what_was_learned(chart):
     gaussian = nearnesses(torch.full((20,), 0.8, dtype=torch.float64), 0.05, 0.01)
     if chart == "cartesian":
         gaussian = cartesian_from_inverse_range(gaussian, direction)
-    seen, prior = observed_at(direction, gaussian), Prior(0.5, 0.5)
-    memory, empty = enter(AHEAD, seen, fusion, prior), new_egosphere(AHEAD, prior, chart)
-    index, spacing = build_index(AHEAD), neighbour_spacing_rad(AHEAD)
+    seen, prior = observed_at(direction, gaussian, chart=chart), Prior(0.5, 0.5)
+    memory, empty = enter(AHEAD, seen, fusion, prior), empty_memory(AHEAD, prior, chart)
     nothing = seen._replace(valid=torch.zeros(20, dtype=torch.bool))
     later = memory
     for _ in range(3):
-        later = remember(later, index, spacing, nothing, fusion, prior)
+        later = remember(later, nothing, fusion)
     for now, then, first in zip(later.information, memory.information, empty.information, strict=True):
         torch.testing.assert_close(now - first, 0.5 * (then - first))
     torch.testing.assert_close(later.bearing - empty.bearing, 0.5 * (memory.bearing - empty.bearing))
-    gone = forget(memory, prior, chart, 0.0)
+    gone = forget(memory, 0.0)
     torch.testing.assert_close(gone.information.matrix, empty.information.matrix)
 
 
@@ -381,8 +382,8 @@ def test_gradients():
     found = gaussians(3, 0)
 
     def through_points(mean, cov, common):
-        pooled = add_common(pool(Gaussian(mean, cov), cell, ONE, 3), common, "cartesian")
-        return tuple(belief(fuse(new_egosphere(cells, Prior(), "cartesian"), pooled)))
+        pooled = add_common(pool(Gaussian(mean, cov), cell, (3,)), common, "cartesian")
+        return tuple(belief(fuse(empty_memory(cells, Prior(), "cartesian"), pooled)))
 
     common = pack(0.01 * torch.eye(3, dtype=torch.float64)).expand(3, 6)
     leaves = [x.clone().contiguous().requires_grad_() for x in (*found, common)]
@@ -392,9 +393,9 @@ def test_gradients():
     ones = torch.ones(3, dtype=torch.float64)
 
     def through_patches(rho, variance, bearing, row, common):
-        pooled = add_common(pool_patches(rho, variance, bearing, row, ones, cell, ONE, 3), common, "inverse_range", 1.0)
-        memory = fuse(new_egosphere(cells, Prior()), pooled)
-        return (*belief(memory), *cartesian_belief(memory, "inverse_range"))
+        pooled = add_common(pool_patches(rho, variance, bearing, row, ones, cell, (3,)), common, "inverse_range", 1.0)
+        memory = fuse(empty_memory(cells, Prior()), pooled)
+        return (*belief(memory), *cartesian_belief(memory))
 
     leaves = [x.clone().contiguous().requires_grad_() for x in (0.7 * ones, 0.1 * ones, 50 * ones, row, common)]
     assert torch.autograd.gradcheck(through_patches, leaves)
@@ -406,12 +407,11 @@ def test_gradients_of_a_whole_saccade(fusion):
     gaussian = nearnesses(torch.linspace(0.6, 0.7, 5, dtype=torch.float64), 0.1, 0.02)
     if fusion.chart == "cartesian":
         gaussian = cartesian_from_inverse_range(gaussian, direction)
-    index, spacing = build_index(AHEAD), neighbour_spacing_rad(AHEAD)
 
     def through(mean, cov):
-        seen = observed_at(direction, Gaussian(mean, cov))
-        memory = new_egosphere(AHEAD, Prior(), fusion.chart)
-        return tuple(belief(remember(memory, index, spacing, seen, fusion, Prior())))
+        seen = observed_at(direction, Gaussian(mean, cov), chart=fusion.chart)
+        memory = empty_memory(AHEAD, Prior(), fusion.chart)
+        return tuple(belief(remember(memory, seen, fusion)))
 
     leaves = [x.clone().contiguous().requires_grad_() for x in gaussian]
     assert torch.autograd.gradcheck(through, leaves)
@@ -420,8 +420,8 @@ def test_gradients_of_a_whole_saccade(fusion):
 @pytest.mark.parametrize("chart", ["inverse_range", "cartesian"])
 def test_an_empty_memory_believes_the_prior(chart, dtype):
     cells = fibonacci_directions(10, dtype)
-    memory = new_egosphere(cells, Prior(0.5, 0.2, 0.1), chart)
-    moments, points = belief(memory), cartesian_belief(memory, chart)
+    memory = empty_memory(cells, Prior(0.5, 0.2, 0.1), chart)
+    moments, points = belief(memory), cartesian_belief(memory)
     assert moments.mean.dtype == points.cov.dtype == dtype
     torch.testing.assert_close(moments.cov[:, 5], torch.full((10,), 0.04, dtype=dtype))
     torch.testing.assert_close(inverse3(memory.information.matrix), moments.cov)
@@ -437,10 +437,13 @@ def test_an_empty_memory_believes_the_prior(chart, dtype):
 
 def test_a_million_cells(generator):
     cells = torch.nn.functional.normalize(torch.randn(1_000_000, 3, generator=generator), dim=-1)
-    memory = new_egosphere(cells, Prior())
+    information, bearing = prior_information(cells, Prior())
+    zero = torch.zeros(1_000_000)
+    known = {"information": information, "bearing": bearing, "looks": zero, "lasting": columns(zero, zero)}
+    memory = empty_memory(cells[:1], Prior())._replace(cells=cells, **known)  # fusing asks no index
     ones, cell = torch.ones(5000), torch.arange(5000) * 199
     row = torch.tensor([0.0, 0, 1]).expand(5000, 3)
-    after = fuse(memory, pool_patches(0.5 * ones, 1e-4 * ones, 1e4 * ones, row, ones, cell, ONE, 1_000_000))
+    after = fuse(memory, pool_patches(0.5 * ones, 1e-4 * ones, 1e4 * ones, row, ones, cell, (1_000_000,)))
     assert int(after.looks.sum()) == 5000
     torch.testing.assert_close(belief(after).mean[cell, 2], torch.full((5000,), 0.5), atol=1e-3, rtol=0)
 
@@ -457,11 +460,11 @@ def test_a_million_cells(generator):
         (lambda: Prior(std=0), "prior.std = 0"),
         (lambda: Prior(mean=math.inf), "prior.mean = inf"),
         (lambda: Prior(slope_std=-1), "prior.slope_std = -1"),
-        (lambda: new_egosphere(torch.zeros(0, 3), Prior()), "memory.cells = 0"),
-        (lambda: new_egosphere(torch.ones(2, 3), Prior()), "finite unit vectors"),
-        (lambda: new_egosphere(torch.full((2, 3), torch.nan), Prior()), "finite unit vectors"),
-        (lambda: new_egosphere(torch.ones(2, 2), Prior()), "cells = \\(2, 2\\)"),
-        (lambda: forget(new_egosphere(AHEAD, Prior()), Prior(), "inverse_range", 1.5), "keep = 1.5"),
+        (lambda: empty_memory(torch.zeros(0, 3), Prior()), "memory.cells = 0"),
+        (lambda: empty_memory(torch.ones(2, 3), Prior()), "finite unit vectors"),
+        (lambda: empty_memory(torch.full((2, 3), torch.nan), Prior()), "finite unit vectors"),
+        (lambda: empty_memory(torch.ones(2, 2), Prior()), "cells = \\(2, 2\\)"),
+        (lambda: forget(empty_memory(AHEAD, Prior()), 1.5), "keep = 1.5"),
     ],
 )
 def test_errors_name_the_setting(call, message):
@@ -472,12 +475,14 @@ def test_errors_name_the_setting(call, message):
 @pytest.mark.parametrize("fusion", ["inverse_range", "aligned"])
 def test_a_memory_keeps_its_dtype(fusion):
     cells = fibonacci_directions(40).float()
-    how, seen = Fusion(name=fusion), observed_at(fibonacci_directions(40), gaussians(40, 0))
-    memory, index, spacing = new_egosphere(cells, Prior(), how.chart), build_index(cells), neighbour_spacing_rad(cells)
+    how = Fusion(name=fusion)
+    seen = observed_at(fibonacci_directions(40), gaussians(40, 0), chart=how.chart)
+    memory = empty_memory(cells, Prior(), how.chart)
     common = torch.full((40, 6), 1e-6, dtype=torch.float64)
-    rough = Observations(*(part.float() if part.is_floating_point() else part for part in seen))
-    double = remember(memory, index, spacing, seen, how, Prior(), common)
-    single = remember(memory, index, spacing, rough, how, Prior(), common.float())
+    numbers = ("mean", "cov", "direction", "support_rad", "inlier")
+    rough = seen._replace(**{name: getattr(seen, name).float() for name in numbers})
+    double = remember(memory, seen, how, common)
+    single = remember(memory, rough, how, common.float())
     for a, b in zip(double.information, single.information, strict=True):
         assert a.dtype == torch.float32
         torch.testing.assert_close(a, b)
@@ -493,9 +498,9 @@ def test_priors_and_charts_that_float32_cannot_hold_are_named():
     for size in (1e-9, 1e9):
         prior = Prior(std=size, bearing_std=size, slope_std=size)
         for chart in ("inverse_range", "cartesian"):
-            moments = belief(new_egosphere(cells, prior, chart))
+            moments = belief(empty_memory(cells, prior, chart))
             assert all(bool(part.isfinite().all()) for part in moments)
     with pytest.raises(SettingError, match="chart = polar"):
-        new_egosphere(cells, Prior(), "polar")
+        empty_memory(cells, Prior(), "polar")
     with pytest.raises(SettingError, match=r"fusion.fill = no"):
         Fusion(fill="no")

@@ -6,12 +6,12 @@ from functools import partial
 import pytest
 import torch
 
-from torchfovea.arena import Fixation, Look, Move, Together, Truth
+from torchfovea.arena import Fixation, Look, Move, Together, Truth, stack
 from torchfovea.deciding.strategies import expected_improvement, probability_of_improvement, upper_confidence_bound
-from torchfovea.episode import run_episode, run_episodes, stack_minds
+from torchfovea.episode import run_episode, run_episodes
 from torchfovea.memory.egosphere import Fusion, Prior
 from torchfovea.memory.sphere import fibonacci_directions
-from torchfovea.perception import Eligibility, Observer, decide, new_mind, perceive
+from torchfovea.perception import Eligibility, Observer, decide, new_memory, perceive
 from torchfovea.sensing.camera import Pinhole
 from torchfovea.sensing.correspondence import Budget, Correspondences
 from torchfovea.sensing.geometric import correspond_points
@@ -78,9 +78,9 @@ def cells_in_reach(count: int, dtype=torch.float64) -> torch.Tensor:
 
 
 def run(observer: Observer, seed: int = 0, saccades: int = 8, dtype=torch.float64, cells: int = 4000):
-    arena, mind = Spheres(observer), new_mind(observer, cells_in_reach(cells, dtype))
+    arena, memory = Spheres(observer), new_memory(observer, cells_in_reach(cells, dtype))
     generator = torch.Generator().manual_seed(seed)
-    return run_episode(observer, mind, arena, arena.truth(mind.memory.cells), saccades, generator)
+    return run_episode(observer, memory, arena, arena.truth(memory.cells), saccades, generator)
 
 
 @pytest.mark.parametrize("retina", [LogPolar(1500), Uniform(1500)], ids=["log_polar", "uniform"])
@@ -143,18 +143,18 @@ def test_ground_is_no_object_and_too_near_is_not_looked_at():
     observer = small(eligibility=Eligibility(nearest_m=2.9, ground_z_m=-10))
     assert not run(observer, saccades=4).hit.any()  # the ball is nearer than 2.9 m
     ground = run(small(eligibility=Eligibility(ground_z_m=10)), saccades=2)
-    seen = ground.step.mind.memory.looks > 0
+    seen = ground.step.memory.looks > 0
     assert not (ground.step.eligible & seen).any()
 
 
 def test_nothing_seen_and_nothing_eligible():
     observer = small()
-    mind = new_mind(observer, cells_in_reach(2000))
+    memory = new_memory(observer, cells_in_reach(2000))
     px = torch.zeros(5, 2, dtype=torch.float64)
     blind = Correspondences(px, px, px[:, 0], px[:, 0], torch.zeros(5, dtype=torch.bool))
     zero = torch.zeros((), dtype=torch.float64)
-    after = perceive(observer, mind, blind, eyes(HEAD, Gaze(zero, zero, zero)))
-    assert after.memory.looks.sum() == 0
+    after = perceive(observer, memory, blind, eyes(HEAD, Gaze(zero, zero, zero)))
+    assert after.looks.sum() == 0
     step = decide(observer, after, torch.Generator().manual_seed(0))
     assert step.cell >= 0 and bool(torch.isfinite(step.points.cov).all())
     # ties among unseen cells are broken by the generator
@@ -170,7 +170,7 @@ def test_nothing_seen_and_nothing_eligible():
         (lambda: run(small(), saccades=0), "saccades = 0"),
         (lambda: small(reward="profit"), "reward = profit"),
         (lambda: Eligibility(nearest_m=-1), "eligibility.nearest_m = -1"),
-        (lambda: new_mind(small(), torch.zeros(0, 3)), "cells"),
+        (lambda: new_memory(small(), torch.zeros(0, 3)), "cells"),
     ],
 )
 def test_errors_name_the_setting(call, message):
@@ -186,18 +186,18 @@ def test_alpha_infinity_is_pure_exploration():
 
 def test_a_batch_is_its_episodes_one_by_one():
     observer = small(retina=LogPolar(800), acquisition=partial(upper_confidence_bound, alpha=2.0))
-    minds = [new_mind(observer, cells_in_reach(n)[:350]) for n in (3000, 3300)]
+    memories = [new_memory(observer, cells_in_reach(n)[:350]) for n in (3000, 3300)]
     arena = Spheres(observer)
     alone = [
-        run_episode(observer, mind, arena, arena.truth(mind.memory.cells), 4, torch.Generator().manual_seed(seed))
-        for seed, mind in enumerate(minds)
+        run_episode(observer, memory, arena, arena.truth(memory.cells), 4, torch.Generator().manual_seed(seed))
+        for seed, memory in enumerate(memories)
     ]
     settings = torch.tensor([2.0, 2.0], dtype=torch.float64)
     together = run_episodes(
         small(retina=LogPolar(800), acquisition=partial(upper_confidence_bound, alpha=settings)),
-        stack_minds(minds),
+        stack(memories),
         Together([arena, arena]),
-        [arena.truth(mind.memory.cells) for mind in minds],
+        [arena.truth(memory.cells) for memory in memories],
         4,
         [torch.Generator().manual_seed(seed) for seed in range(2)],
     )
@@ -211,11 +211,11 @@ def test_a_batch_is_its_episodes_one_by_one():
 
 def test_the_stop_rule_ends_on_the_best_cell():
     observer = small(retina=LogPolar(800))
-    arena, mind = Spheres(observer), new_mind(observer, cells_in_reach(1500))
+    arena, memory = Spheres(observer), new_memory(observer, cells_in_reach(1500))
 
     def search(stop):
         generator = torch.Generator().manual_seed(0)
-        return run_episode(observer, mind, arena, arena.truth(mind.memory.cells), 9, generator, stop=stop)
+        return run_episode(observer, memory, arena, arena.truth(memory.cells), 9, generator, stop=stop)
 
     easy, never = search((10.0, 0.5)), search(None)
     assert easy.looks == 1 and never.looks == 9

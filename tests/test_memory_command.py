@@ -11,6 +11,7 @@ from torchfovea.cli import main
 from torchfovea.config import conf_dir
 from torchfovea.experiments.memory_study import judge_cells
 from torchfovea.memory.sphere import fibonacci_directions
+from torchfovea.memory.store import load_memory
 from torchfovea.sim.scene import Cans, build_scene
 from torchfovea.sim.world import World
 
@@ -114,3 +115,16 @@ def test_cells_straddle_edges_and_nothing_else():
     torch.testing.assert_close(judge.rho, 1 / hits.range_m)
     down = (cells[:, 2] < -0.9) & (hits.normal[:, 2] > 0.999)
     assert judge.straddles[down].double().mean() < 0.05
+
+
+def test_cells_that_were_drawn_can_be_searched_with_and_drawn_again(folder, capsys):
+    _, result = memory(capsys, "memory=top", "memory.cells=200", "memory.save=cells.npz")
+    saved = load_memory("cells.npz")
+    assert len(saved.cells) == result["cells"] and int(saved.looks.sum()) == 0
+    assert memory(capsys, "memory.load=cells.npz")[1] == pytest.approx(result, rel=1e-4)
+    small = ["fidelity=geometric", "saccades=2", "sensor.receptive_fields=400", "picture=false", "episodes=1"]
+    assert main(["search", *small, "memory.load=cells.npz", "memory.save=known.npz"]) == 0, capsys.readouterr().err
+    assert torch.equal(load_memory("known.npz").cells, saved.cells) and int(load_memory("known.npz").looks.max()) == 2
+    capsys.readouterr()
+    assert main(["memory", "study=fusion", "memory.load=cells.npz"]) != 0
+    assert "memory.load = cells.npz: expected null with a study" in " ".join(capsys.readouterr().err.split())

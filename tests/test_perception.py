@@ -19,7 +19,7 @@ from torchfovea.experiments.strategy import build_stop, build_strategy
 from torchfovea.gaussian import Information
 from torchfovea.memory.egosphere import Fusion, Prior
 from torchfovea.memory.sphere import fibonacci_directions
-from torchfovea.perception import Eligibility, Observer, decide, gaze_at, new_mind, reward_of
+from torchfovea.perception import Eligibility, Observer, decide, gaze_at, new_memory, reward_of
 from torchfovea.sensing.camera import Pinhole
 from torchfovea.sensing.correspondence import Budget
 from torchfovea.sensing.head import Gaze, Head, gaze_point
@@ -143,10 +143,10 @@ def test_decide_hands_over_what_it_knows():
         return view.mean, len(seen)
 
     observer = Observer(acquisition=spy)
-    mind = new_mind(observer, fibonacci_directions(60, torch.float64))
+    memory = new_memory(observer, fibonacci_directions(60, torch.float64))
     zero = torch.zeros((), dtype=torch.float64)
-    first = decide(observer, mind)
-    second = decide(observer, mind, None, Gaze(zero + 0.3, zero, zero), first)
+    first = decide(observer, memory)
+    second = decide(observer, memory, None, Gaze(zero + 0.3, zero, zero), first)
     assert seen[0].state is None and seen[0].last == -1 and seen[1].state == 1 and second.state == 2
     assert seen[1].last == first.cell
     assert torch.allclose(seen[0].line_of_sight, torch.tensor([1.0, 0, 0], dtype=torch.float64))
@@ -203,10 +203,10 @@ def test_the_configuration_has_the_defaults_of_the_dataclasses():
                 assert value == getattr(kind(), field.name), f"{kind.__name__}.{field.name}"
 
 
-def known_mind(observer: Observer, cells: torch.Tensor, rho: torch.Tensor, votes: tuple[float, float]):
-    """A mind that has seen every other cell at inverse ranges (Nx,), with these votes for and against."""
-    mind = new_mind(observer, cells)
-    memory, seen = mind.memory, (torch.arange(len(cells)) % 2 == 0).to(cells)
+def known_memory(observer: Observer, cells: torch.Tensor, rho: torch.Tensor, votes: tuple[float, float]):
+    """A memory that has seen every other cell at inverse ranges (Nx,), with these votes for and against."""
+    memory = new_memory(observer, cells)
+    seen = (torch.arange(len(cells)) % 2 == 0).to(cells)
     if observer.fusion.chart == "cartesian":
         points = cells / rho[:, None]
         matrix = torch.tensor([1.0, 0, 0, 1, 0, 1]).to(cells) * 1e4
@@ -218,7 +218,7 @@ def known_mind(observer: Observer, cells: torch.Tensor, rho: torch.Tensor, votes
         )
     total = Information(*(a + b for a, b in zip(memory.information, information, strict=True)))
     counted = seen[:, None] * torch.tensor(votes).to(cells)
-    return mind._replace(memory=memory._replace(information=total, looks=seen, votes=counted))
+    return memory._replace(information=total, looks=seen, votes=counted)
 
 
 @pytest.mark.parametrize("fusion", ["inverse_range", "aligned"])
@@ -227,22 +227,22 @@ def test_a_function_of_points_is_a_reward_as_good_as_a_named_one(fusion):
     prior = Prior() if fusion == "inverse_range" else Prior(4.0, 4.0)
     named = Observer(fusion=Fusion(fusion), prior=prior, reward="range")
     own = dataclasses.replace(named, reward=lambda x: -x.norm(dim=-1))
-    mind = known_mind(
+    memory = known_memory(
         named, cells, 0.3 + torch.rand(60, generator=torch.Generator().manual_seed(0)).to(cells), (1.0, 0.0)
     )
-    for a, b in zip(reward_of(named, mind)[1], reward_of(own, mind)[1], strict=True):
+    for a, b in zip(reward_of(named, memory)[1], reward_of(own, memory)[1], strict=True):
         torch.testing.assert_close(a, b)
     point = torch.tensor([0.5, 0.3, -0.2], dtype=cells.dtype)
     near = dataclasses.replace(named, reward=nearest_to(point))
-    points, reward = reward_of(near, mind)
+    points, reward = reward_of(near, memory)
     torch.testing.assert_close(reward.mean[::2], -(points.mean - point).norm(dim=-1)[::2])
-    assert int(decide(near, mind).cell) >= 0
+    assert int(decide(near, memory).cell) >= 0
 
 
 def test_a_surface_is_worth_as_much_as_it_is_believed():
     cells, observer = fibonacci_directions(60), Observer()
     rho = torch.full((60,), 1.5, dtype=cells.dtype)
-    sure, doubtful = (reward_of(observer, known_mind(observer, cells, rho, v))[1] for v in ((3.0, 0.0), (0.3, 2.7)))
+    sure, doubtful = (reward_of(observer, known_memory(observer, cells, rho, v))[1] for v in ((3.0, 0.0), (0.3, 2.7)))
     prior = observer.prior
     std = doubtful.std[0].item()
     torch.testing.assert_close(sure.mean[::2], rho[::2], rtol=1e-3, atol=0)
@@ -257,5 +257,5 @@ def test_the_eyes_do_not_meet_at_a_surface_that_is_doubted():
     observer = Observer()
     rho = torch.tensor([1.5], dtype=torch.float64)
     for votes, range_m in (((2.0, 0.0), 1 / 1.5), ((0.2, 1.8), 1 / observer.prior.mean)):
-        step = decide(observer, known_mind(observer, cells, rho, votes))
+        step = decide(observer, known_memory(observer, cells, rho, votes))
         assert gaze_point(observer.head, step.gaze).norm().item() == pytest.approx(range_m, rel=1e-3)

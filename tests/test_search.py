@@ -5,8 +5,10 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 
 from torchfovea.cli import main
+from torchfovea.memory.store import load_memory
 
 SMALL = ["episodes=1", "saccades=3", "sensor.receptive_fields=2000", "memory.cells=1500", "sensor.source_px=200"]
 RESULT = {
@@ -138,3 +140,30 @@ def test_encoder_noise_is_that_of_the_seed_whatever_the_batch(folder, capsys):
     second, _ = search(capsys, *common, "episodes=1", "seed=1")
     rows = [line.partition(",")[2] for line in courses[0].splitlines() if line.startswith("1,")]
     assert rows == [line.partition(",")[2] for line in (second / "saccades.csv").read_text().splitlines()[1:]]
+
+
+@pytest.mark.parametrize("more", [[], ["motor=physics"]], ids=["together", "one by one"])
+def test_a_search_goes_on_from_a_saved_memory(folder, capsys, more):
+    alike = ["fidelity=geometric", "picture=false", *more]
+    search(capsys, *alike, "episodes=2", "memory.save=first.npz")
+    search(capsys, *alike, "memory.load=first.npz", "memory.save=second.npz")
+    first, second = (load_memory(name) for name in ("first.npz", "second.npz"))
+    assert torch.equal(first.cells, second.cells) and int(first.looks.max()) == 3
+    gained = second.looks - first.looks
+    assert gained.min() == 0 and int(gained.max()) == 3  # three more saccades
+
+
+def test_memories_that_do_not_fit_are_refused_before_the_work(folder, capsys):
+    alike = ["fidelity=geometric", "picture=false"]
+    search(capsys, *alike, "memory.save=patches.npz")
+    for setting, message in (
+        ("memory.load=none.npz", "memory.load = none.npz: expected a memory"),
+        ("memory.load=3", "memory.load = 3: expected a file's name"),
+        ("memory.save=memory.pt", "memory.save = memory.pt: expected a name that ends in .npz"),
+        ("memory.save=away/memory.npz", "memory.save = away/memory.npz: expected a name"),
+        ("memory.load=patches.npz fusion=aligned prior=cartesian", "fusion.chart = cartesian: expected inverse_range"),
+        ("memory.load=patches.npz prior.std=0.3", "the prior of the memory"),
+    ):
+        assert main(["search", *SMALL, *alike, *setting.split()]) != 0
+        said = capsys.readouterr().err
+        assert message in " ".join(said.split()), said

@@ -8,10 +8,11 @@ import torch
 from torchfovea.arena import Together
 from torchfovea.perception import Observer
 from torchfovea.sensing.camera import Pinhole
+from torchfovea.sensing.fields import draw_fields
 from torchfovea.sensing.head import Gaze, Head, eyes, to_ego
 from torchfovea.sensing.layout import LogPolar, Uniform
 from torchfovea.setting import SettingError
-from torchfovea.sim.arena import Arena, draw_fields
+from torchfovea.sim.arena import Arena
 from torchfovea.sim.arenas import GeometricArenas
 from torchfovea.sim.cans import Cans
 from torchfovea.sim.model import EgoPose

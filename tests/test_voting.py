@@ -9,12 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchfovea.gaussian import columns
-from torchfovea.memory.egosphere import Fusion, Prior, belief, new_egosphere, trust
-from torchfovea.memory.nearest import build_index, neighbour_spacing_rad
+from torchfovea.memory.egosphere import Fusion, Prior, belief, empty_memory, trust
 from torchfovea.memory.pooling import pool_patches, share_errors
 from torchfovea.memory.update import fuse, remember
 from torchfovea.memory.voting import Sight, against, cast
-from torchfovea.sensing.correspondence import Budget, Kinship, kinship
+from torchfovea.sensing.correspondence import Budget, Clues, Correspondences
+from torchfovea.sensing.kinship import Kinship, kinship, lasting_share
 from torchfovea.sensing.layout import LogPolar
 from torchfovea.sensing.triangulation import Observations
 
@@ -34,9 +34,9 @@ def look(rho: float, inlier: float = 1.0, fields: int = 9, sigma: float = 0.01) 
 
 
 def after(*looks: Observations, kin: Kinship | None = None):
-    memory, index, spacing = new_egosphere(AHEAD, PRIOR), build_index(AHEAD), neighbour_spacing_rad(AHEAD)
+    memory = empty_memory(AHEAD, PRIOR)
     for seen in looks:
-        memory = remember(memory, index, spacing, seen, FUSION, PRIOR, None, kin)
+        memory = remember(memory, seen, FUSION, None, kin)
     return memory
 
 
@@ -112,7 +112,7 @@ def test_votes_are_counted_as_in_a_loop(seed):
 
 
 def test_what_no_one_doubts_is_believed_and_what_is_unseen_is_not():
-    memory = new_egosphere(AHEAD, PRIOR)
+    memory = empty_memory(AHEAD, PRIOR)
     assert trust(memory).item() == 0
     for rho in (0.01, 0.5, 3.0):
         assert trust(after(look(rho))).item() == 1
@@ -153,9 +153,10 @@ def test_what_fields_share_does_not_average_out(fields, patches, alike):
     variance = 0.04 * (ones if alike else torch.linspace(0.2, 5, fields, dtype=torch.float64))
     error = (correlation**0.5 * common + (1 - correlation) ** 0.5 * own) * variance.sqrt()
     row, cell = columns(0 * ones, 0 * ones, ones), torch.zeros(fields, dtype=torch.int64)
-    pooled = pool_patches(ones, variance, ones, row, ones, cell, ONE, 1)
-    precision = columns((1 / variance).sum(), variance.rsqrt().sum())[None]
-    told, lasting = share_errors(pooled, precision, torch.tensor([patches], dtype=torch.float64), shared, 0.3)
+    pooled = pool_patches(ones, variance, ones, row, ones, cell, (1,))
+    root = variance.rsqrt().sum()
+    precision = columns((1 / variance).sum(), root, 0.3**0.5 * root)[None]
+    told, lasting = share_errors(pooled, precision, torch.tensor([patches], dtype=torch.float64), shared)
     claimed = 1 / told.information.matrix[0, 5].item()
     mean = (error / variance).sum(1) / (1 / variance).sum()
     assert mean.var().item() == pytest.approx(claimed, rel=0.03)
@@ -172,17 +173,18 @@ def test_what_lasts_between_looks_stays():
     error = lasting + torch.randn(runs, 4, generator=rng, dtype=torch.float64) * (u - part).sqrt()
     weight = 1 / u
     actual = ((error * weight).sum(1) / weight.sum()).var().item()
-    memory = new_egosphere(AHEAD, Prior(mean=0.5, std=50.0))
+    memory = empty_memory(AHEAD, Prior(mean=0.5, std=50.0))
     for one, lasts in zip(u, part, strict=True):
         ones = torch.ones(1, dtype=torch.float64)
         row = columns(0 * ones, 0 * ones, ones)
-        pooled = pool_patches(0.5 * ones, one * ones, ones, row, ones, torch.zeros(1, dtype=torch.int64), ONE, 1)
+        pooled = pool_patches(0.5 * ones, one * ones, ones, row, ones, torch.zeros(1, dtype=torch.int64), (1,))
         memory = fuse(memory, pooled, columns(lasts.sqrt() / one, lasts / one**2)[None])
     assert belief(memory).cov[0, 5].item() == pytest.approx(actual, rel=0.03)
 
 
 def test_a_memory_cannot_be_surer_than_what_lasts():
-    seen, kin = look(0.4, fields=25), Kinship(torch.full((25,), 0.04, dtype=torch.float64), 0.6, 0.3)
+    patch, lasting = (torch.full((25,), x, dtype=torch.float64) for x in (0.04, 0.3))
+    seen, kin = look(0.4, fields=25), Kinship(patch, 0.6, lasting)
     floor = 0.3 * 0.01**2 / 2  # the fields cover one patch
     variances = [belief(after(*[seen] * k, kin=kin)).cov[0, 5].item() for k in (1, 2, 10, 200)]
     assert all(later < sooner for sooner, later in pairwise(variances))
@@ -193,13 +195,30 @@ def test_a_memory_cannot_be_surer_than_what_lasts():
 def test_kinship_counts_fields_by_the_patches_they_cover():
     retina = LogPolar(2000)
     px = retina.centers_px()
-    assert kinship(Budget.printed, retina, px) is None and kinship(Budget(), retina, px) is None
-    kin = kinship(Budget(source_px=400, shared=0.5, shared_px=4, shared_widths=2, lasting=0.2), retina, px)
+    sigma = torch.full_like(px[:, 0], 0.1)
+    matches = Correspondences(px, px, sigma, sigma, sigma > 0)
+    assert kinship(Budget.printed, retina, matches) is None and kinship(Budget(), retina, matches) is None
+    kin = kinship(Budget(source_px=400, shared=0.5, shared_px=4, shared_widths=2, lasting=0.2), retina, matches)
     width = retina.width_px(px)
     length = torch.maximum(torch.full_like(width, 2.0), 2 * width)
     torch.testing.assert_close(kin.patch, width**2 / (2 * math.pi * length**2))
-    half = kinship(Budget(shared=0.5, shared_widths=2), retina, px, 0.5)
+    assert (kin.lasting == 0.2).all()
+    # fields that stand for twice as many, and know what of their error lasts
+    told = matches._replace(support_px=width / math.sqrt(2), lasting=torch.rand_like(sigma))
+    half = kinship(Budget(shared=0.5, shared_widths=2), retina, told)
     torch.testing.assert_close(half.patch, kin.patch * 2)
+    assert half.lasting is told.lasting
+
+
+def test_what_edges_add_to_a_variance_lasts():
+    budget = Budget(bend=0.5, gap=0.2, fringe=0.1, noise=0.7, shared=0.6, lasting=0.3)
+    one = torch.ones(1)
+    clues = Clues(2 * one, one, 3 * one, 4 * one)
+    edges = 2 * (1.0 + 0.04 + 0.09)
+    share = lasting_share(budget, clues, torch.tensor([4.0]))
+    assert share.item() == pytest.approx(0.3 + 0.7 * edges / 4)
+    assert lasting_share(budget, Clues(0 * one, 0 * one), one).item() == pytest.approx(0.3)
+    assert lasting_share(budget, clues, torch.tensor([edges])).item() == pytest.approx(1.0)
 
 
 def test_gradients_reach_inlier_probabilities():

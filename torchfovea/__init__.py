@@ -11,10 +11,12 @@ from torchfovea.deciding.acquisition import (
     upper_confidence_bound,
 )
 from torchfovea.gaussian import Gaussian, Information
-from torchfovea.memory.egosphere import EgoSphere, Fusion, Prior, belief, cartesian_belief, new_egosphere
+from torchfovea.memory.egosphere import Fusion, Memory, Prior, belief, cartesian_belief, forget
+from torchfovea.memory.moving import Motion, motion, move, resample
 from torchfovea.memory.sphere import DirectionMixture, direction_mixture, log_density, sample
+from torchfovea.memory.store import load_memory, save_memory
 from torchfovea.memory.update import remember
-from torchfovea.perception import Eligibility, Observer, decide, new_mind, perceive
+from torchfovea.perception import Eligibility, Observer, decide, new_memory, perceive
 from torchfovea.sensing.camera import Fisheye, Pinhole
 from torchfovea.sensing.correspondence import Budget, Correspondences
 from torchfovea.sensing.head import Eyes, Gaze, Head, cyclopean, eyes, fixate
@@ -30,7 +32,6 @@ __all__ = [
     "Budget",
     "Correspondences",
     "DirectionMixture",
-    "EgoSphere",
     "Eligibility",
     "Eyes",
     "Fisheye",
@@ -40,6 +41,8 @@ __all__ = [
     "Head",
     "Information",
     "LogPolar",
+    "Memory",
+    "Motion",
     "Observations",
     "Observer",
     "Pinhole",
@@ -56,16 +59,21 @@ __all__ = [
     "expected_improvement",
     "eyes",
     "fixate",
+    "forget",
     "fovea",
+    "load_memory",
     "log_density",
     "log_expected_improvement",
-    "new_egosphere",
-    "new_mind",
+    "motion",
+    "move",
+    "new_memory",
     "observe",
     "perceive",
     "reconstruct",
     "remember",
+    "resample",
     "sample",
+    "save_memory",
     "triangulate",
     "unscented_transform",
     "upper_confidence_bound",

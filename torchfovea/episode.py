@@ -14,9 +14,9 @@ from torch import Tensor
 
 from torchfovea.arena import Arena, Arenas, Fixation, Look, Move, Together, Truth, row, stack
 from torchfovea.deciding.acquisition import known_well_enough
-from torchfovea.memory.nearest import join_indices
+from torchfovea.memory.egosphere import Memory
 from torchfovea.metrics import gap, global_information, local_information, near_target, regret, saccades_to_target
-from torchfovea.perception import Mind, Observer, Step, decide, gaze_at, perceive
+from torchfovea.perception import Observer, Step, decide, gaze_at, perceive
 from torchfovea.sensing.head import Gaze, eyes, fixate, gaze_point
 from torchfovea.setting import require
 
@@ -31,15 +31,7 @@ __all__ = [
     "Truth",
     "run_episode",
     "run_episodes",
-    "stack_minds",
 ]
-
-
-def stack_minds(minds: Sequence[Mind]) -> Mind:
-    """Empty memories of the same number of cells as one batch (B, Nx)."""
-    memory = stack([mind.memory for mind in minds])
-    lookup = join_indices([mind.lookup for mind in minds])
-    return Mind(memory, lookup, torch.stack([mind.spacing_rad for mind in minds]))
 
 
 class Episode(NamedTuple):
@@ -88,7 +80,7 @@ class Episode(NamedTuple):
 
 def run_episode(
     observer: Observer,
-    mind: Mind,
+    memory: Memory,
     arena: Arena,
     truth: Truth,
     saccades: int,
@@ -102,7 +94,7 @@ def run_episode(
 
     Args:
         observer: the fixed parts.
-        mind: an empty memory, see `new_mind`; its dtype is the episode's.
+        memory: what is known at the start, see `torchfovea.perception.new_memory`; its dtype is the episode's.
         arena: where.
         truth: for the metrics only.
         saccades: T ≥ 1, the initial gaze included.
@@ -118,18 +110,17 @@ def run_episode(
 
     def show(t: int, look: Look, step: Step) -> None:
         if each is not None:
-            each(t, Look(row(look.matches, 0), look.pictures[0]), _step_of(step, 0))
+            each(t, Look(row(look.matches, 0), look.pictures[0]), row(step._replace(state=None), 0))
 
-    alone = Mind(stack([mind.memory]), mind.lookup, mind.spacing_rad[None])
     episode = run_episodes(
-        observer, alone, Together([arena]), [truth], saccades, [generator], far_m, near_target_m, show, stop
+        observer, stack([memory]), Together([arena]), [truth], saccades, [generator], far_m, near_target_m, show, stop
     )[0]
     return episode._replace(look=Look(episode.look.matches, episode.look.pictures[0]))
 
 
 def run_episodes(
     observer: Observer,
-    mind: Mind,
+    memory: Memory,
     arenas: Arenas,
     truths: Sequence[Truth],
     saccades: int,
@@ -143,7 +134,7 @@ def run_episodes(
 
     Args:
         observer: the fixed parts, alike for all; a strategy may have settings (B,).
-        mind: B empty memories, see `stack_minds`.
+        memory: B memories, see `torchfovea.arena.stack`.
         arenas: where.
         truths: for the metrics only, B.
         saccades: T ≥ 1, the initial gaze included.
@@ -160,7 +151,7 @@ def run_episodes(
     require(saccades >= 1, "saccades", saccades, "at least 1")
     for truth in truths:
         require(0 < truth.nearest_m < far_m, "far_m", far_m, f"more than the nearest range, {truth.nearest_m:.3f} m")
-    cells = mind.memory.cells
+    cells = memory.cells
     zero = cells.new_zeros(cells.shape[0])
     gaze, done = Gaze(zero, zero, zero), torch.zeros_like(zero, dtype=torch.bool)
     near = torch.stack([near_target(t.cell_points, t.nearest_point, near_target_m) for t in truths]).to(cells.device)
@@ -185,8 +176,8 @@ def run_episodes(
         look = arenas.look(executed, generators)
         looks = looks + ~done
         matches = look.matches._replace(valid=look.matches.valid & ~done[:, None])
-        mind = perceive(observer, mind, matches, eyes(observer.head, executed))
-        step = decide(observer, mind, generators, executed, step)
+        memory = perceive(observer, memory, matches, eyes(observer.head, executed))
+        step = decide(observer, memory, generators, executed, step)
         compute += time.perf_counter() - start
         gaze = step.gaze
         if stop is not None:
@@ -221,7 +212,7 @@ def run_episodes(
     episodes = []
     for b, truth in enumerate(truths):
         best = torch.tensor(-truth.nearest_m, dtype=torch.float64)
-        own = _step_of(step, b)
+        own = row(step._replace(state=None), b)
         episodes.append(
             Episode(
                 gaze=Gaze(*(angle[b] for angle in gazes)),
@@ -247,16 +238,9 @@ def run_episodes(
     return episodes
 
 
-def _step_of(step: Step, b: int) -> Step:
-    """One episode's part of a step; the index of the cells stays that of the batch."""
-    mind = step.mind
-    kept = row(step._replace(mind=None, state=None), b)  # type: ignore[arg-type]
-    return kept._replace(mind=Mind(row(mind.memory, b), mind.lookup, mind.spacing_rad[b]))
-
-
 def _target_error(step: Step, truth: Truth) -> float | None:
     """Distance from the best seen eligible cell's mean to the truth; None if nothing eligible was seen."""
-    eligible = step.eligible & (step.mind.memory.looks > 0)
+    eligible = step.eligible & (step.memory.looks > 0)
     if not bool(eligible.any()):
         return None
     best = torch.where(eligible, step.reward.mean, torch.full_like(step.reward.mean, -torch.inf)).argmax()

@@ -22,22 +22,23 @@ from torchfovea.deciding.reward import (
 from torchfovea.deciding.strategies import DEFAULT, Strategy, View, evaluate
 from torchfovea.gaussian import Gaussian, columns
 from torchfovea.memory.egosphere import (
-    EgoSphere,
     Fusion,
+    Memory,
     Prior,
     belief,
     cartesian_belief,
     cartesian_from_patches,
-    new_egosphere,
+    check_chart,
+    empty_memory,
     trust,
 )
 from torchfovea.memory.encoders import encoder_covariance
-from torchfovea.memory.nearest import CellIndex, build_index, neighbour_spacing_rad
 from torchfovea.memory.update import Common, remember
 from torchfovea.memory.voting import against
 from torchfovea.sensing.camera import Camera, Pinhole
-from torchfovea.sensing.correspondence import Budget, Correspondences, kinship
+from torchfovea.sensing.correspondence import Budget, Correspondences
 from torchfovea.sensing.head import Eyes, Gaze, Head, cyclopean, fixate, to_ego
+from torchfovea.sensing.kinship import kinship
 from torchfovea.sensing.layout import LogPolar, Retina
 from torchfovea.sensing.triangulation import observe
 from torchfovea.sensing.unscented import SigmaPoints
@@ -45,7 +46,7 @@ from torchfovea.setting import require
 
 SAME_GAZE_DEG = 2.0  # looks nearer to each other than about this see the same pixels of the same surfaces
 
-__all__ = ["Eligibility", "Mind", "Observer", "Step", "decide", "gaze_at", "new_mind", "perceive", "reward_of"]
+__all__ = ["Eligibility", "Observer", "Step", "check_owner", "decide", "gaze_at", "new_memory", "perceive", "reward_of"]
 
 
 @dataclass(frozen=True)
@@ -103,27 +104,11 @@ class Observer:
         require(known, "reward", self.reward, "inverse_range, range or a function of points (..., 3)")
 
 
-class Mind(NamedTuple):
-    """A memory with the index that finds its cells.
-
-    Attributes:
-        memory: the ego-sphere.
-        lookup: finds the cell of a direction.
-        spacing_rad: distance of each cell to its neighbours, (..., Nx).
-        axis: where the left eye looked last, unit (..., 3) in E; None: there was no look.
-    """
-
-    memory: EgoSphere
-    lookup: CellIndex
-    spacing_rad: Tensor
-    axis: Tensor | None = None
-
-
 class Step(NamedTuple):
     """What one step leaves behind.
 
     Attributes:
-        mind: with what the saccade brought.
+        memory: with what the saccade brought.
         points: 3-D belief of every cell (..., Nx).
         reward: its reward (..., Nx).
         eligible: which cells may be fixated, bool (..., Nx).
@@ -132,7 +117,7 @@ class Step(NamedTuple):
         state: the strategy's own, for the next decision.
     """
 
-    mind: Mind
+    memory: Memory
     points: Gaussian
     reward: RewardBelief
     eligible: Tensor
@@ -141,30 +126,46 @@ class Step(NamedTuple):
     state: Any = None
 
 
-def new_mind(observer: Observer, cells: Tensor) -> Mind:
-    """An empty memory over given cells (..., Nx, 3), indexed."""
-    memory = new_egosphere(cells, observer.prior, observer.fusion.chart)
-    return Mind(memory, build_index(cells), neighbour_spacing_rad(cells))
+def new_memory(observer: Observer, cells: Tensor) -> Memory:
+    """An observer's empty memory over given cells, unit directions (Nx, 3), or of B memories (B, Nx, 3).
+
+    Raises:
+        SettingError: for no cells, or directions that are not unit vectors.
+    """
+    return empty_memory(cells, observer.prior, observer.fusion.chart)
+
+
+def check_owner(observer: Observer, memory: Memory) -> None:
+    """Refuse another observer's memory, whose numbers would mean something else.
+
+    Raises:
+        SettingError: for a memory of another chart or prior than the observer's; it names both.
+    """
+    check_chart(memory, observer.fusion.chart, "fusion.chart")
+    require(observer.prior == memory.prior, "prior", observer.prior, f"{memory.prior}, the prior of the memory")
 
 
 def perceive(
-    observer: Observer, mind: Mind, matches: Correspondences, eyes: Eyes, common: Common | None = None
-) -> Mind:
+    observer: Observer, memory: Memory, matches: Correspondences, eyes: Eyes, common: Common | None = None
+) -> Memory:
     """Enter one saccade's correspondences into the memory.
 
     Args:
         observer: the fixed parts.
-        mind: before.
+        memory: before.
         matches: the saccade's correspondences (..., N).
         eyes: where the eyes were.
         common: what the receptive fields' errors share, see `torchfovea.memory.egosphere.remember`; by default what the
             head's encoders get wrong.
 
-    Differentiable in the correspondences. Where only some of the receptive fields were looked through, each stands for
-    as many more as are missing and covers a wider patch.
+    Differentiable in the correspondences. Leaving out those that are not valid changes nothing: what each stands for
+    it carries itself.
+
+    Raises:
+        SettingError: for a memory of another chart or prior than the observer's.
     """
-    share = observer.retina.count / max(1, matches.valid.shape[-1])
-    support = observer.retina.width_px(matches.left_px) / 2 * math.sqrt(max(1.0, share))
+    check_owner(observer, memory)
+    support = observer.retina.width_px(matches.left_px) / 2 if matches.support_px is None else matches.support_px
     observed = observe(
         matches, eyes, observer.camera, support, observer.points, observer.fusion.chart, observer.rotated
     )
@@ -172,23 +173,22 @@ def perceive(
     if common is None and sigma > 0:
         common = partial(encoder_covariance, eyes=eyes, sigma_rad=(sigma,) * 3, chart=observer.fusion.chart)
     axis = eyes.R_left[..., 2]
-    kin = kinship(observer.budget, observer.retina, matches.left_px, 1 / share)
-    if kin is not None and mind.axis is not None:
+    kin = kinship(observer.budget, observer.retina, matches)
+    if kin is not None and memory.axis is not None:
         # what looks at one place from one gaze share is all that its fields share
-        same = torch.exp(-(((axis - mind.axis).norm(dim=-1, keepdim=True) / math.radians(SAME_GAZE_DEG)).square()))
-        kin = kin._replace(lasting=kin.lasting + (kin.shared - kin.lasting) * same)
-    before = mind.memory
-    after = remember(before, mind.lookup, mind.spacing_rad, observed, observer.fusion, observer.prior, common, kin)
+        same = torch.exp(-(((axis - memory.axis).norm(dim=-1, keepdim=True) / math.radians(SAME_GAZE_DEG)).square()))
+        kin = kin._replace(lasting=kin.lasting + (kin.shared - kin.lasting).clamp(min=0) * same)
+    after = remember(memory, observed, observer.fusion, common, kin)
     if observer.fusion.votes:
-        missed = (after.looks == before.looks) & _in_view(observer, before, eyes)
+        missed = (after.looks == memory.looks) & _in_view(observer, memory, eyes)
         after = after._replace(votes=against(after.votes, missed))
-    return mind._replace(memory=after, axis=axis)
+    return after._replace(axis=axis)
 
 
-def _in_view(observer: Observer, memory: EgoSphere, eyes: Eyes) -> Tensor:
+def _in_view(observer: Observer, memory: Memory, eyes: Eyes) -> Tensor:
     """Which cells' points fall on both retinas, bool (..., Nx)."""
     with torch.no_grad():
-        points = cartesian_belief(memory, observer.fusion.chart).mean
+        points = cartesian_belief(memory).mean
         inside = torch.ones_like(memory.looks, dtype=torch.bool)
         for rotation, origin in ((eyes.R_left, eyes.t_left), (eyes.R_right, eyes.t_right)):
             direction = to_ego(rotation.mT, points - origin.unsqueeze(-2))
@@ -196,17 +196,17 @@ def _in_view(observer: Observer, memory: EgoSphere, eyes: Eyes) -> Tensor:
     return inside
 
 
-def _rewards(observer: Observer, mind: Mind) -> tuple[Gaussian, RewardBelief, RewardBelief]:
+def _rewards(observer: Observer, memory: Memory) -> tuple[Gaussian, RewardBelief, RewardBelief]:
     """Points of the surfaces, their reward, and that of an unseen one: a number, or one for each cell."""
-    moments, prior, cartesian = belief(mind.memory), observer.prior, observer.fusion.chart == "cartesian"
-    points = moments if cartesian else cartesian_from_patches(moments, mind.memory)
+    moments, prior, cartesian = belief(memory), memory.prior, memory.chart == "cartesian"
+    points = moments if cartesian else cartesian_from_patches(moments, memory)
     if not isinstance(observer.reward, str):
         # the prior's range is uncertain along the ray; in x, y, z it is so in every direction
         sigma = prior.std if cartesian else prior.std / prior.mean**2
-        x, y, z = mind.memory.cells.unbind(-1)
+        x, y, z = memory.cells.unbind(-1)
         zero, one = torch.zeros_like(x), torch.ones_like(x)
         shape = (one, zero, zero, one, zero, one) if cartesian else (x * x, x * y, x * z, y * y, y * z, z * z)
-        unseen = Gaussian(_unseen_points(observer, mind), columns(*(sigma**2 * part for part in shape)))
+        unseen = Gaussian(_unseen_points(memory), columns(*(sigma**2 * part for part in shape)))
         return points, user_reward(observer.reward, points), user_reward(observer.reward, unseen)
     like = points.mean.dtype
     if cartesian:
@@ -222,7 +222,7 @@ def _rewards(observer: Observer, mind: Mind) -> tuple[Gaussian, RewardBelief, Re
     return points, reward, then
 
 
-def reward_of(observer: Observer, mind: Mind) -> tuple[Gaussian, RewardBelief]:
+def reward_of(observer: Observer, memory: Memory) -> tuple[Gaussian, RewardBelief]:
     """Each cell's 3-D belief and reward (Eq. 36-40).
 
     A surface is worth its reward as far as it is believed, for the rest what an unseen cell is: mean and standard
@@ -230,8 +230,8 @@ def reward_of(observer: Observer, mind: Mind) -> tuple[Gaussian, RewardBelief]:
     comparison of thousands. Of the prior's standard deviation looks that should have shown something, and did not,
     leave less and less. Unseen cells that no look has reached share the prior's reward exactly: ties are ties.
     """
-    points, reward, unseen = _rewards(observer, mind)
-    sure, fruitless = trust(mind.memory), mind.memory.votes[..., 1]
+    points, reward, unseen = _rewards(observer, memory)
+    sure, fruitless = trust(memory), memory.votes[..., 1]
     mean, std = (then.to(reward.mean) for then in unseen)
     std = std * (1 + fruitless).rsqrt()
     mean = torch.where(sure > 0, sure * reward.mean + (1 - sure) * mean, mean)
@@ -239,15 +239,15 @@ def reward_of(observer: Observer, mind: Mind) -> tuple[Gaussian, RewardBelief]:
     return points, RewardBelief(mean, std)
 
 
-def _unseen_points(observer: Observer, mind: Mind) -> Tensor:
+def _unseen_points(memory: Memory) -> Tensor:
     """Where each cell's point would be if it had not been seen, (..., Nx, 3) [m]."""
-    prior = observer.prior.mean
-    return mind.memory.cells * (prior if observer.fusion.chart == "cartesian" else 1 / prior)
+    prior = memory.prior.mean
+    return memory.cells * (prior if memory.chart == "cartesian" else 1 / prior)
 
 
 def decide(
     observer: Observer,
-    mind: Mind,
+    memory: Memory,
     generator: Generators | None = None,
     gaze: Gaze | None = None,
     before: Step | None = None,
@@ -256,18 +256,20 @@ def decide(
 
     Args:
         observer: the fixed parts.
-        mind: what is known, (...).
+        memory: what is known, (...).
         generator: breaks exact ties, and draws lots for the strategies that do; one, or one for each row.
         gaze: where the head looks now, (...), for strategies that mind the way; straight ahead if not given.
         before: the decision before, for strategies that remember.
+
+    Raises:
+        SettingError: for a memory of another chart or prior than the observer's.
     """
-    points, reward = reward_of(observer, mind)
-    seen = mind.memory.looks > 0
+    check_owner(observer, memory)
+    points, reward = reward_of(observer, memory)
+    seen = memory.looks > 0
     # the eyes meet where the surface is, or where an unseen one would be while it is more likely not there
-    doubted = seen & (trust(mind.memory) < 0.5)
-    target, reachable = fixate(
-        observer.head, torch.where(doubted[..., None], _unseen_points(observer, mind), points.mean)
-    )
+    doubted = seen & (trust(memory) < 0.5)
+    target, reachable = fixate(observer.head, torch.where(doubted[..., None], _unseen_points(memory), points.mean))
     ground = seen & (points.mean[..., 2] + observer.head.ego_height_m < observer.eligibility.ground_z_m)
     far_enough = (points.mean * points.mean).sum(-1) > observer.eligibility.nearest_m**2
     eligible = reachable & far_enough & ~ground
@@ -281,7 +283,7 @@ def decide(
         reward.std,
         incumbent,
         eligible,
-        mind.memory.cells,
+        memory.cells,
         cyclopean(observer.head, Gaze(zero, zero, zero) if gaze is None else gaze)[0][..., 2],
         torch.full_like(zero, -1, dtype=torch.int64) if before is None else before.cell,
         generator,
@@ -289,7 +291,7 @@ def decide(
     )
     score, state = evaluate(observer.acquisition, view)
     cell = choose(score, eligible, generator)
-    return Step(mind, points, reward, eligible, cell, gaze_at(target, cell), state)
+    return Step(memory, points, reward, eligible, cell, gaze_at(target, cell), state)
 
 
 def gaze_at(gazes: Gaze, cell: Tensor) -> Gaze:

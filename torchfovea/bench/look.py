@@ -9,8 +9,10 @@ import torch
 from torch import Tensor
 
 from torchfovea.gaussian import columns
-from torchfovea.perception import Mind, Observer, new_mind
+from torchfovea.memory.egosphere import Memory
+from torchfovea.perception import Observer, new_memory
 from torchfovea.sensing.correspondence import Correspondences
+from torchfovea.sensing.fields import for_all
 from torchfovea.sensing.geometric import correspond_points
 from torchfovea.sensing.head import Eyes, eyes, fixate, to_ego
 
@@ -22,13 +24,13 @@ class Saccade(NamedTuple):
 
     Attributes:
         observer: of patches, without what its peers do not do.
-        mind: an empty memory.
+        memory: an empty one.
         matches: of a look (N,).
         pose: of the eyes.
     """
 
     observer: Observer
-    mind: Mind
+    memory: Memory
     matches: Correspondences
     pose: Eyes
 
@@ -51,7 +53,7 @@ def saccade(observer: Observer, cells: Tensor, device: str = "cpu", seed: int = 
     seen = torch.ones(len(left), dtype=torch.bool)
     generator = torch.Generator().manual_seed(seed)
     matches = correspond_points(points, seen, left, pose, observer.camera, observer.retina, observer.budget, generator)
-    return moved_to(Saccade(observer, new_mind(observer, cells), matches, pose), device)
+    return moved_to(Saccade(observer, new_memory(observer, cells), matches, pose), device)
 
 
 def part_of(look: Saccade, count: int) -> Saccade:
@@ -59,7 +61,7 @@ def part_of(look: Saccade, count: int) -> Saccade:
     every = torch.linspace(0, look.matches.valid.shape[-1] - 1, count).long().to(look.matches.valid.device)
     kept = look.matches.take(every)
     left_px, right_px = (columns(*part.unbind(-1)) for part in kept[:2])
-    return look._replace(matches=kept._replace(left_px=left_px, right_px=right_px))
+    return look._replace(matches=for_all(kept._replace(left_px=left_px, right_px=right_px), look.observer.retina))
 
 
 def support_of(look: Saccade) -> Tensor:
@@ -81,10 +83,10 @@ def shares(most: int) -> tuple[int, ...]:
 def batch_of(looks: Sequence[Saccade]) -> Saccade:
     """Saccades of equal sizes as one, memories indexed together."""
     first = looks[0]
-    cells = torch.stack([look.mind.memory.cells.cpu() for look in looks])
-    device = str(first.mind.memory.cells.device)
+    cells = torch.stack([look.memory.cells.cpu() for look in looks])
+    device = str(first.memory.cells.device)
     matches = [torch.stack(parts) for parts in zip(*(look.matches for look in looks), strict=True)]
     matches = [columns(*part.unbind(-1)) if part.dim() == 3 else part for part in matches]
     pose = Eyes(*(torch.stack(parts) for parts in zip(*(look.pose for look in looks), strict=True)))
-    mind = moved_to(new_mind(first.observer, columns(*cells.unbind(-1))), device)
-    return Saccade(first.observer, mind, Correspondences(*matches), pose)
+    memory = moved_to(new_memory(first.observer, columns(*cells.unbind(-1))), device)
+    return Saccade(first.observer, memory, Correspondences(*matches), pose)

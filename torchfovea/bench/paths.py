@@ -15,11 +15,11 @@ from torchfovea.bench.look import Saccade, flat_of, moved_to, part_of, shares, s
 from torchfovea.bench.timing import Growth, Path, Peer, nbytes, same
 from torchfovea.gaussian import Gaussian, columns, pack, unpack
 from torchfovea.memory.association import Pairs, associate, gather_columns
-from torchfovea.memory.egosphere import Prior, belief, new_egosphere
+from torchfovea.memory.egosphere import Prior, belief, empty_memory
 from torchfovea.memory.nearest import nearest_cell
 from torchfovea.memory.pooling import pool, pool_patches
 from torchfovea.memory.update import fuse
-from torchfovea.perception import new_mind
+from torchfovea.perception import new_memory
 from torchfovea.sensing.chart import basis
 from torchfovea.sensing.triangulation import Observations, observe
 from torchfovea.sensing.unscented import SigmaPoints
@@ -82,7 +82,7 @@ def _triangulate(look: Saccade) -> Path:
 
 def _align(look: Saccade) -> Path:
     found = _observe(look, support_of(look))
-    cells, lookup = look.mind.memory.cells, look.mind.lookup
+    cells, lookup = look.memory.cells, look.memory.lookup
     directions = columns(*found.direction[found.valid].unbind(-1))
     rows, count = directions.cpu().contiguous(), len(directions)
     tree = cKDTree(cells.cpu().double().numpy())
@@ -106,7 +106,7 @@ def _align(look: Saccade) -> Path:
     cell_sizes = shares(len(cells))
     by_cells = tuple(
         partial(
-            nearest_cell, moved_to(new_mind(look.observer, cells[:size].cpu()), str(cells.device)).lookup, directions
+            nearest_cell, moved_to(new_memory(look.observer, cells[:size].cpu()), str(cells.device)).lookup, directions
         )
         for size in cell_sizes
     )
@@ -127,7 +127,7 @@ def _align(look: Saccade) -> Path:
 
 def _fuse(look: Saccade) -> list[Path]:
     found = _observe(look, support_of(look))
-    cells, device, prior = look.mind.memory.cells, str(look.mind.memory.cells.device), look.observer.prior
+    cells, device, prior = look.memory.cells, str(look.memory.cells.device), look.observer.prior
     pairs = _pairs(look, found)
     chosen = gather_columns(found.direction, pairs.observation)
     own, count = gather_columns(cells, pairs.cell), len(cells)
@@ -135,26 +135,26 @@ def _fuse(look: Saccade) -> list[Path]:
         part.reshape(-1)[pairs.observation] for part in (found.mean[..., 2], found.cov[..., 5], 2 / (found.cov[..., 0]))
     )
     row = columns(*((chosen * axis).sum(-1) for axis in (*basis(own), own)))
-    keep, batch = torch.ones_like(rho), torch.Size([])
+    keep, shape = torch.ones_like(rho), (count,)
 
     # points, as printed: any covariances will do, so take the observations' own shapes about the points
     gaussian = Gaussian(columns(*(chosen / rho.clamp(min=0.05)[:, None]).unbind(-1)), _shaped(chosen, rho, spread))
     square, mean, memory = (
         unpack(gaussian.cov).contiguous(),
         gaussian.mean.contiguous(),
-        new_egosphere(cells, Prior(), "cartesian"),
+        empty_memory(cells, Prior(), "cartesian"),
     )
     vector, matrix = memory.information.vector.contiguous(), unpack(memory.information.matrix).contiguous()
 
     def points() -> Gaussian:
-        return belief(fuse(memory, pool(gaussian, pairs.cell, batch, count)))
+        return belief(fuse(memory, pool(gaussian, pairs.cell, shape)))
 
-    patches = new_egosphere(cells, prior)
+    patches = empty_memory(cells, prior)
     rows = row.contiguous()
     first, second = patches.information.vector.contiguous(), unpack(patches.information.matrix).contiguous()
 
     def planes() -> Gaussian:
-        return belief(fuse(patches, pool_patches(rho, spread, bearing, row, keep, pairs.cell, batch, count)))
+        return belief(fuse(patches, pool_patches(rho, spread, bearing, row, keep, pairs.cell, shape)))
 
     others = (
         partial(peers.fuse_gaussians, mean, square, pairs.cell, vector, matrix),
@@ -175,7 +175,7 @@ def _fuse(look: Saccade) -> list[Path]:
 
     def part(size: int) -> Any:
         less = Gaussian(*(columns(*p[:size].unbind(-1)) for p in gaussian))
-        return lambda: belief(fuse(memory, pool(less, pairs.cell[:size], batch, count)))
+        return lambda: belief(fuse(memory, pool(less, pairs.cell[:size], shape)))
 
     return [
         Path(
@@ -198,9 +198,9 @@ def _shaped(direction: Tensor, rho: Tensor, variance: Tensor) -> Tensor:
 
 
 def _pairs(look: Saccade, found: Observations) -> Pairs:
-    fusion, mind = look.observer.fusion, look.mind
+    fusion, memory = look.observer.fusion, look.memory
     gate = math.radians(fusion.gate_deg)
-    return associate(mind.memory.cells, mind.lookup, mind.spacing_rad, found, gate, fusion.gate_spacing, fusion.fill)
+    return associate(memory.cells, memory.lookup, memory.spacing_rad, found, gate, fusion.gate_spacing, fusion.fill)
 
 
 def paths_of_look(look: Saccade) -> list[Path]:

@@ -15,7 +15,8 @@ from torchfovea.bench.look import Saccade, batch_of, flat_of, moved_to, part_of,
 from torchfovea.bench.timing import Growth, Path, Peer, nbytes, same
 from torchfovea.deciding.strategies import upper_confidence_bound
 from torchfovea.gaussian import columns, unpack
-from torchfovea.perception import Mind, Observer, decide, new_mind, perceive
+from torchfovea.memory.egosphere import Memory
+from torchfovea.perception import Observer, decide, new_memory, perceive
 from torchfovea.sensing.triangulation import observe
 from torchfovea.sensing.unscented import SigmaPoints
 from torchfovea.setting import require
@@ -23,9 +24,8 @@ from torchfovea.setting import require
 __all__ = ["batched_steps", "paths_of_steps"]
 
 
-def _known(mind: Mind) -> tuple[Any, ...]:
+def _known(memory: Memory) -> tuple[Any, ...]:
     """Cells, information and counts in NumPy, the matrices whole."""
-    memory = mind.memory
     parts = (memory.cells, memory.information.vector, unpack(memory.information.matrix), memory.bearing)
     return (*(part.cpu().contiguous().numpy() for part in parts), (memory.looks > 0).cpu().numpy())
 
@@ -53,11 +53,11 @@ def _same_choice(what: str, ours: Any, theirs: peers.Choice, share: float) -> No
 
 
 def _decide(look: Saccade) -> Path:
-    observer, mind = look.observer, perceive(look.observer, look.mind, look.matches, look.pose)
+    observer, memory = look.observer, perceive(look.observer, look.memory, look.matches, look.pose)
     prior = (observer.prior.mean, observer.prior.std)
-    cells, vector, matrix, bearing, seen = _known(mind)
+    cells, vector, matrix, bearing, seen = _known(memory)
     limits = _limits(observer)
-    ours = partial(decide, observer, mind)
+    ours = partial(decide, observer, memory)
 
     def theirs() -> peers.Choice:
         return peers.decide(cells, vector, matrix, bearing, seen, observer.head, prior, limits, _alpha(observer))
@@ -65,10 +65,9 @@ def _decide(look: Saccade) -> Path:
     def check() -> None:
         _same_choice("decide", ours(), theirs(), 0.999)
 
-    sizes = shares(mind.memory.cells.shape[0])
+    sizes = shares(memory.cells.shape[0])
 
     def part(size: int) -> Any:
-        memory = mind.memory
         less = memory._replace(
             cells=columns(*memory.cells[:size].unbind(-1)),
             information=type(memory.information)(*(columns(*p[:size].unbind(-1)) for p in memory.information)),
@@ -77,35 +76,35 @@ def _decide(look: Saccade) -> Path:
             lasting=columns(*memory.lasting[:size].unbind(-1)),
             votes=columns(*memory.votes[:size].unbind(-1)),
         )
-        return partial(decide, observer, mind._replace(memory=less))
+        return partial(decide, observer, less)
 
     done = ours()
     return Path(
         "decide",
-        f"{len(mind.memory.cells)} cells",
-        str(mind.memory.cells.device),
+        f"{len(memory.cells)} cells",
+        str(memory.cells.device),
         ours,
         (Peer("NumPy, linalg.inv", theirs),),
         check,
-        nbytes(mind.memory, done.points, done.reward, done.eligible),
+        nbytes(memory, done.points, done.reward, done.eligible),
         (Growth("cells", sizes, tuple(map(part, sizes))),),
     )
 
 
 def _one_step(look: Saccade) -> Any:
-    return decide(look.observer, perceive(look.observer, look.mind, look.matches, look.pose))
+    return decide(look.observer, perceive(look.observer, look.memory, look.matches, look.pose))
 
 
 def _step(look: Saccade, full: Observer) -> list[Path]:
-    observer, mind = look.observer, look.mind
-    cells, vector, matrix, bearing, _ = _known(mind)
+    observer, memory = look.observer, look.memory
+    cells, vector, matrix, bearing, _ = _known(memory)
     px, sigma = (part.cpu().numpy() for part in flat_of(look.matches))
     rig = peers.converted(peers.rig_of(look.pose, observer.camera.focal_px), lambda a: a.astype(px.dtype))
     support = observe(look.matches, look.pose, observer.camera, support_of(look)).support_rad.cpu().numpy()
     gates = (math.radians(observer.fusion.gate_deg), observer.fusion.gate_spacing)
     theirs = partial(
         peers.step, px, sigma, support, look.matches.valid.cpu().numpy(), rig, SigmaPoints(), cKDTree(cells),
-        peers.tangent_frames(np, cells), mind.spacing_rad.cpu().numpy(), gates, vector, matrix, bearing,
+        peers.tangent_frames(np, cells), memory.spacing_rad.cpu().numpy(), gates, vector, matrix, bearing,
         observer.prior.slope_std, observer.head, (observer.prior.mean, observer.prior.std), _limits(observer),
         _alpha(observer),
     )  # fmt: skip
@@ -118,18 +117,18 @@ def _step(look: Saccade, full: Observer) -> list[Path]:
         if int(_one_step(look._replace(observer=full)).cell) < 0:
             raise RuntimeError("step: nothing to fixate")
 
-    done, device = ours(), str(mind.memory.cells.device)
+    done, device = ours(), str(memory.cells.device)
     work = f"{len(px)} RFs to {len(cells)} cells to the next fixation"
     sizes, cell_sizes = shares(len(px)), shares(len(cells))
     by_cells = tuple(
-        partial(_one_step, look._replace(mind=moved_to(new_mind(observer, mind.memory.cells[:n].cpu()), device)))
+        partial(_one_step, look._replace(memory=moved_to(new_memory(observer, memory.cells[:n].cpu()), device)))
         for n in cell_sizes
     )
     growths = (
         Growth("RFs", sizes, tuple(partial(_one_step, part_of(look, n)) for n in sizes)),
         Growth("cells", cell_sizes, by_cells),
     )
-    moved = nbytes(look.matches, mind.memory, done.mind.memory, done.points, done.reward, done.eligible)
+    moved = nbytes(look.matches, memory, done.memory, done.points, done.reward, done.eligible)
     return [
         Path("step", work, device, ours, (Peer("NumPy and SciPy, vectorized", theirs),), check, moved, growths),
         Path(
@@ -163,7 +162,7 @@ def batched_steps(observer: Observer, cells: Tensor, batch: int, device: str) ->
         partial(_one_step, together),
         (Peer("one by one", loop),),
         check,
-        nbytes(together.matches, together.mind.memory, done.mind.memory, done.points, done.reward, done.eligible),
+        nbytes(together.matches, together.memory, done.memory, done.points, done.reward, done.eligible),
         (Growth("batch", sizes, runs),) if len(sizes) > 1 else (),
         batch,
     )

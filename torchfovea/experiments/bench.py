@@ -25,7 +25,7 @@ from torchfovea.experiments.build import build_arena, build_cells, build_observe
 from torchfovea.experiments.rollout import roll_out
 from torchfovea.experiments.settings import construct
 from torchfovea.files import write_csv, write_result
-from torchfovea.perception import Observer, Step, decide, new_mind, perceive
+from torchfovea.perception import Observer, Step, decide, new_memory, perceive
 from torchfovea.sensing.camera import image_camera
 from torchfovea.sensing.head import Gaze, eyes
 from torchfovea.sensing.layout import LogPolar
@@ -239,13 +239,13 @@ def _saccade(cfg: DictConfig, observer: Observer) -> Path:
     settings = OmegaConf.merge(cfg, {"fidelity": "photometric", "sensor": {"sample": None}})
     assert isinstance(settings, DictConfig)
     arena, generator = build_arena(settings, observer, int(cfg.seed)), torch.Generator().manual_seed(int(cfg.seed))
-    mind = new_mind(observer, build_cells(cfg, observer.head, generator))
+    memory = new_memory(observer, build_cells(cfg, observer.head, generator))
     zero = torch.zeros(())
     gaze = Gaze(zero, zero + 0.3, zero + 0.1)
 
     def saccade() -> Step:
         look = arena.look(gaze, generator)
-        return decide(observer, perceive(observer, mind, look.matches, eyes(observer.head, gaze)), generator)
+        return decide(observer, perceive(observer, memory, look.matches, eyes(observer.head, gaze)), generator)
 
     def check() -> None:
         if int(saccade().cell) < 0:

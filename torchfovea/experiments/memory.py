@@ -9,12 +9,16 @@ from rich.table import Table
 
 from torchfovea.config import run_folder
 from torchfovea.experiments.build import build_arena, build_cells, build_observer, choice, number, whole
+from torchfovea.experiments.memories import loaded_memory, memory_path
 from torchfovea.experiments.memory_honesty import study_honesty
 from torchfovea.experiments.memory_moving import study_moving, study_resampling
 from torchfovea.experiments.memory_study import Rows, study_encoders, study_fusion
 from torchfovea.files import write_csv, write_result
 from torchfovea.memory.nearest import neighbour_spacing_rad
+from torchfovea.memory.store import save_memory
 from torchfovea.metrics import near_target
+from torchfovea.perception import new_memory
+from torchfovea.setting import require
 
 __all__ = ["run"]
 
@@ -38,7 +42,13 @@ def run(cfg: DictConfig) -> float:
     toward = torch.nn.functional.normalize(arena.world.scene.nearest_point_e.double(), dim=-1)
     if OmegaConf.select(cfg, "memory.means", default="none") is None:  # a bias that is aimed at the scene's own target
         cfg = OmegaConf.merge(cfg, {"memory": {"means": [toward.tolist()]}})  # type: ignore[assignment]
-    cells = build_cells(cfg, observer.head, torch.Generator().manual_seed(seed), torch.float64)
+    loaded, saved = loaded_memory(cfg, observer), memory_path(cfg, "memory.save")
+    if loaded is None:
+        cells = build_cells(cfg, observer.head, torch.Generator().manual_seed(seed), torch.float64)
+    else:
+        cells = loaded.cells.double()
+    if saved is not None:
+        save_memory(saved, new_memory(observer, cells.float()))
     truth = arena.truth(cells)
     near = near_target(truth.cell_points, truth.nearest_point, number(cfg, "near_target_m"))
     spacing = torch.rad2deg(neighbour_spacing_rad(cells))
@@ -63,6 +73,8 @@ def run(cfg: DictConfig) -> float:
 
 def _study(cfg: DictConfig, name: str) -> float:
     """Run a study; its table goes to NAME.csv, to the screen and, by dotted keys, to result.json."""
+    for setting in ("memory.load", "memory.save"):
+        require(OmegaConf.select(cfg, setting) is None, setting, OmegaConf.select(cfg, setting), "null with a study")
     folder, rows = run_folder(), Rows()
     STUDIES[name](cfg, rows)
     write_csv(folder / f"{name}.csv", rows.columns, rows.rows)

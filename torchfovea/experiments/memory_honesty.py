@@ -14,9 +14,9 @@ from torchfovea.config import conf_dir
 from torchfovea.experiments.build import build_arena, build_cells, build_observer, whole
 from torchfovea.experiments.memory_study import Judge, Rows, fixation_course, judge_cells
 from torchfovea.experiments.progress import progress_bar
-from torchfovea.memory.egosphere import belief, trust
+from torchfovea.memory.egosphere import Memory, belief, trust
 from torchfovea.metrics import coverage, nees_mean, outlier_share
-from torchfovea.perception import Mind, Observer, new_mind, perceive
+from torchfovea.perception import Observer, new_memory, perceive
 from torchfovea.sensing.head import Gaze, eyes
 from torchfovea.setting import require
 from torchfovea.sim.arena import Arena
@@ -39,12 +39,12 @@ class Sensor(NamedTuple):
     Attributes:
         observer: with the budget of this sensor.
         arena: of the scene at hand.
-        minds: by number of cells.
+        memories: by number of cells.
     """
 
     observer: Observer
     arena: Arena
-    minds: dict[int, Mind]
+    memories: dict[int, Memory]
 
 
 def study_honesty(cfg: DictConfig, rows: Rows) -> None:
@@ -70,7 +70,7 @@ def study_honesty(cfg: DictConfig, rows: Rows) -> None:
             seeing = {
                 name: Sensor(
                     observers[name], build_arena(settings[name], observers[name], k),
-                    {n: new_mind(observers[name], cells[n]) for n in counts},
+                    {n: new_memory(observers[name], cells[n]) for n in counts},
                 )
                 for name in sensors
             }  # fmt: skip
@@ -79,7 +79,7 @@ def study_honesty(cfg: DictConfig, rows: Rows) -> None:
                 _look(seeing, executed, generator)
                 progress.update(task, advance=1)
                 for name, n in [(s, n) for s in sensors for n in counts if t in marks]:
-                    found.setdefault((name, n, t), []).append(_known(seeing[name].minds[n], judges[n]))
+                    found.setdefault((name, n, t), []).append(_known(seeing[name].memories[n], judges[n]))
     rows.rows += [(*labels, *_figures(parts)) for labels, parts in found.items()]
 
 
@@ -119,7 +119,7 @@ def _with_cells(cfg: DictConfig, count: int) -> DictConfig:
 def _look(seeing: dict[str, Sensor], gaze: Gaze, generator: torch.Generator) -> None:
     """One look by every sensor into all its memories; the pictures are taken once."""
     pictures = None
-    for name, (observer, arena, minds) in seeing.items():
+    for name, (observer, arena, memories) in seeing.items():
         if arena.matcher is None:
             matches = arena.look(gaze, generator).matches
         else:
@@ -130,14 +130,14 @@ def _look(seeing: dict[str, Sensor], gaze: Gaze, generator: torch.Generator) -> 
             views = verged_views(left, right, rig, observer.camera, retina.radius_px)
             matches, _ = arena.matcher(views, retina, observer.budget)
         pose = eyes(observer.head, gaze)
-        for n, mind in minds.items():
-            seeing[name].minds[n] = perceive(observer, mind, matches, pose)
+        for n, memory in memories.items():
+            seeing[name].memories[n] = perceive(observer, memory, matches, pose)
 
 
-def _known(mind: Mind, judge: Judge) -> tuple[Tensor, ...]:
+def _known(memory: Memory, judge: Judge) -> tuple[Tensor, ...]:
     """Of the believed cells: inverse range, its variance, the truth, whether they straddle an edge; and all seen."""
-    moments, seen = belief(mind.memory), mind.memory.looks > 0
-    sure = seen & (trust(mind.memory) >= 0.5)
+    moments, seen = belief(memory), memory.looks > 0
+    sure = seen & (trust(memory) >= 0.5)
     rho, variance = moments.mean[sure, 2].double(), moments.cov[sure, 5].double()
     return rho, variance, judge.rho[sure], judge.straddles[sure], seen.sum()
 

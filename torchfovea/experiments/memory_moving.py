@@ -11,11 +11,10 @@ from torch import Tensor
 
 from torchfovea.experiments.build import build_arena, build_cells, build_observer, number, whole
 from torchfovea.experiments.memory_study import COLUMNS, Rows, estimate, figures_of, fixation_course, judge_cells
-from torchfovea.memory.egosphere import new_egosphere
+from torchfovea.memory.egosphere import Memory
 from torchfovea.memory.moving import Motion, motion, move, resample
-from torchfovea.memory.nearest import build_index, neighbour_spacing_rad
 from torchfovea.metrics import gap
-from torchfovea.perception import Mind, Observer, decide, new_mind, perceive
+from torchfovea.perception import Observer, decide, new_memory, perceive
 from torchfovea.sensing.head import Gaze, eyes, fixate
 from torchfovea.sim.arena import Arena
 from torchfovea.sim.scene import EgoPose, stand_at
@@ -27,9 +26,9 @@ FIRST_LOOKS = 5  # before the first move, or before the cells are drawn anew
 ODOMETRY_M, ODOMETRY_RAD = 0.005, math.radians(0.3)  # a step's errors along x and y, and of the turn
 
 
-def _look(observer: Observer, mind: Mind, arena: Arena, gaze: Gaze, generator: torch.Generator) -> Mind:
-    told = Gaze(*(a.to(mind.memory.cells) for a in arena.saccade(gaze).gaze))
-    return perceive(observer, mind, arena.look(told, generator).matches, eyes(observer.head, told))
+def _look(observer: Observer, memory: Memory, arena: Arena, gaze: Gaze, generator: torch.Generator) -> Memory:
+    told = Gaze(*(a.to(memory.cells) for a in arena.saccade(gaze).gaze))
+    return perceive(observer, memory, arena.look(told, generator).matches, eyes(observer.head, told))
 
 
 def _yaw(angle: float) -> Tensor:
@@ -66,21 +65,20 @@ def study_moving(cfg: DictConfig, rows: Rows) -> None:
         for k in range(seed, seed + whole(cfg, "episodes")):
             arena = build_arena(cfg, observer, k)
             scene, generator = arena.world.scene, torch.Generator().manual_seed(k)
-            mind = new_mind(observer, build_cells(cfg, observer.head, generator))
-            cells, pose = mind.memory.cells, EgoPose()
+            memory = new_memory(observer, build_cells(cfg, observer.head, generator))
+            cells, pose = memory.cells, EgoPose()
             for gaze in fixation_course(arena, cells, FIRST_LOOKS, k):
-                mind = _look(observer, mind, arena, gaze, generator)
+                memory = _look(observer, memory, arena, gaze, generator)
             for t in range(moves + 1):
                 if t > 0:
                     pose, step = _walk(pose, generator)
-                    memory = move(mind.memory, mind.lookup, mind.spacing_rad, step, observer.fusion, observer.prior)
-                    mind = mind._replace(memory=memory)
+                    memory = move(memory, step, observer.fusion)
                     world = World(stand_at(scene, pose), camera=observer.camera, source_px=arena.world.source_px)
                     arena = Arena(world, observer, arena.matcher, arena.sample, k)
                     for gaze in list(fixation_course(arena, cells, looks + 1, 1000 * t + k))[1:]:
-                        mind = _look(observer, mind, arena, gaze, generator)
+                        memory = _look(observer, memory, arena, gaze, generator)
                 if t in marks:
-                    found[t].append((*estimate(observer, mind), judge_cells(arena.world, cells)))
+                    found[t].append((*estimate(memory), judge_cells(arena.world, cells)))
         rows.rows += [(looks, t, *figures_of(parts)) for t, parts in found.items()]
 
 
@@ -94,25 +92,27 @@ def study_resampling(cfg: DictConfig, rows: Rows) -> None:
         parts = []
         for k in range(seed, seed + whole(cfg, "episodes")):
             arena, generator = build_arena(cfg, observer, k), torch.Generator().manual_seed(k)
-            mind = new_mind(observer, build_cells(cfg, observer.head, generator))
-            zero = torch.zeros((), dtype=mind.memory.cells.dtype)
+            memory = new_memory(observer, build_cells(cfg, observer.head, generator))
+            zero = torch.zeros((), dtype=memory.cells.dtype)
             gaze, rewards, hit, step = Gaze(zero, zero, zero), [], False, None
             for t in range(saccades):
                 told = Gaze(*(a.to(zero) for a in arena.saccade(gaze).gaze))
                 seen = arena.fixation(told)
                 rewards.append(-far_m if seen.is_floor else -min(float(seen.range_m), far_m))
                 hit = hit or bool(seen.is_target)
-                mind = perceive(observer, mind, arena.look(told, generator).matches, eyes(observer.head, told))
-                step = decide(observer, mind, generator, told, step)
+                memory = perceive(observer, memory, arena.look(told, generator).matches, eyes(observer.head, told))
+                step = decide(observer, memory, generator, told, step)
                 if t == FIRST_LOOKS - 1 and name != "never":
-                    mind = _sharpen(observer, mind, step.reward.mean, step.eligible, name.endswith("kept"), generator)
-                    step = decide(observer, mind, generator, told)
+                    memory = _sharpen(
+                        observer, memory, step.reward.mean, step.eligible, name.endswith("kept"), generator
+                    )
+                    step = decide(observer, memory, generator, told)
                 gaze = step.gaze
             assert step is not None
-            truth = arena.truth(mind.memory.cells)
+            truth = arena.truth(memory.cells)
             best = torch.tensor(-truth.nearest_m, dtype=torch.float64)
             course = gap(torch.tensor(rewards, dtype=torch.float64), best)
-            score = torch.where(step.eligible & (mind.memory.looks > 0), step.reward.mean, -torch.inf)
+            score = torch.where(step.eligible & (memory.looks > 0), step.reward.mean, -torch.inf)
             error = float((step.points.mean[score.argmax()] - truth.nearest_point).norm())
             near = (truth.cell_points - truth.nearest_point).norm(dim=-1) < number(cfg, "near_target_m")
             parts.append((float(course[-1]), float(course.mean()), float(hit), error, float(near.sum())))
@@ -120,20 +120,15 @@ def study_resampling(cfg: DictConfig, rows: Rows) -> None:
 
 
 def _sharpen(
-    observer: Observer, mind: Mind, reward: Tensor, eligible: Tensor, keep: bool, generator: torch.Generator
-) -> Mind:
+    observer: Observer, memory: Memory, reward: Tensor, eligible: Tensor, keep: bool, generator: torch.Generator
+) -> Memory:
     """Every second cell is drawn anew within about eight degrees of one of the ten best seen cells."""
-    cells = mind.memory.cells
-    score = torch.where(eligible & (mind.memory.looks > 0), reward, -torch.inf)
+    cells = memory.cells
+    score = torch.where(eligible & (memory.looks > 0), reward, -torch.inf)
     best = cells[score.topk(min(10, len(cells))).indices]
     fresh = best[torch.randint(len(best), (4 * len(cells),), generator=generator)]
     fresh = fresh + 0.14 * torch.randn(fresh.shape, generator=generator, dtype=cells.dtype)
     fresh = torch.nn.functional.normalize(fresh, dim=-1)
     fresh = fresh[fixate(observer.head, fresh)[1]][: len(cells) // 2]
     new = torch.cat([cells[torch.randperm(len(cells), generator=generator)[: len(cells) - len(fresh)]], fresh])
-    fusion, prior = observer.fusion, observer.prior
-    if keep:
-        memory = resample(mind.memory, new, mind.spacing_rad, fusion, prior)
-    else:
-        memory = new_egosphere(new, prior, fusion.chart)
-    return Mind(memory, build_index(new), neighbour_spacing_rad(new))
+    return resample(memory, new, observer.fusion) if keep else new_memory(observer, new)

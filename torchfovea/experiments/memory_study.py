@@ -13,9 +13,9 @@ from torch import Tensor
 
 from torchfovea.experiments.build import build_arena, build_cells, build_observer, whole
 from torchfovea.gaussian import quadratic3
-from torchfovea.memory.egosphere import Fusion, Prior, belief
+from torchfovea.memory.egosphere import Fusion, Memory, Prior, belief
 from torchfovea.memory.nearest import neighbour_spacing_rad
-from torchfovea.perception import Mind, Observer, new_mind, perceive
+from torchfovea.perception import Observer, new_memory, perceive
 from torchfovea.sensing.chart import basis
 from torchfovea.sensing.head import Gaze, eyes, fixate
 from torchfovea.sensing.layout import LogPolar, Retina, Uniform
@@ -118,13 +118,13 @@ def figures_of(estimates: Sequence[tuple[Tensor, Tensor, Tensor, Judge]]) -> tup
     )  # fmt: skip
 
 
-def estimate(observer: Observer, mind: Mind) -> tuple[Tensor, Tensor, Tensor]:
+def estimate(memory: Memory) -> tuple[Tensor, Tensor, Tensor]:
     """Inverse range along the cells, its variance, and whether they were seen."""
-    moments = belief(mind.memory)
-    if observer.fusion.chart == "inverse_range":
-        return moments.mean[..., 2], moments.cov[..., 5], mind.memory.looks > 0
+    moments = belief(memory)
+    if memory.chart == "inverse_range":
+        return moments.mean[..., 2], moments.cov[..., 5], memory.looks > 0
     r = moments.mean.norm(dim=-1)
-    return 1 / r, quadratic3(moments.cov, moments.mean / r[..., None]) / r**4, mind.memory.looks > 0
+    return 1 / r, quadratic3(moments.cov, moments.mean / r[..., None]) / r**4, memory.looks > 0
 
 
 def fixation_course(arena: Arena, cells: Tensor, saccades: int, seed: int) -> Iterator[Gaze]:
@@ -171,14 +171,14 @@ def study_fusion(cfg: DictConfig, rows: Rows) -> None:
             generator = torch.Generator().manual_seed(k)
             cells = build_cells(cfg, base.head, generator)
             judge = judge_cells(arena.world, cells)
-            minds = {name: new_mind(observer, cells) for name, observer in observers.items()}
+            memories = {name: new_memory(observer, cells) for name, observer in observers.items()}
             for t, gaze in enumerate(fixation_course(arena, cells, saccades, k), 1):
                 executed = Gaze(*(a.to(cells) for a in arena.saccade(gaze).gaze))
                 matches, pose = arena.look(executed, generator).matches, eyes(base.head, executed)
                 for name, observer in observers.items():
-                    minds[name] = perceive(observer, minds[name], matches, pose)
+                    memories[name] = perceive(observer, memories[name], matches, pose)
                     if t in marks:
-                        found.setdefault((name, t), []).append((*estimate(observer, minds[name]), judge))
+                        found.setdefault((name, t), []).append((*estimate(memories[name]), judge))
         rows.rows += [(sensor, name, t, *figures_of(parts)) for (name, t), parts in sorted(found.items(), key=_by_mark)]
 
 
@@ -201,11 +201,11 @@ def study_encoders(cfg: DictConfig, rows: Rows) -> None:
             generator = torch.Generator().manual_seed(k)
             cells = build_cells(cfg, base.head, generator)
             judge = judge_cells(arena.world, cells)
-            minds = {name: new_mind(observer, cells) for name, observer in observers.items()}
+            memories = {name: new_memory(observer, cells) for name, observer in observers.items()}
             for gaze in fixation_course(arena, cells, saccades, k):
                 told = Gaze(*(a.to(cells) for a in arena.saccade(gaze).gaze))
                 matches, pose = arena.look(told, generator).matches, eyes(head, told)
-                minds = {name: perceive(observers[name], mind, matches, pose) for name, mind in minds.items()}
-            for name, observer in observers.items():
-                found[name].append((*estimate(observer, minds[name]), judge))
+                memories = {name: perceive(observers[name], m, matches, pose) for name, m in memories.items()}
+            for name, memory in memories.items():
+                found[name].append((*estimate(memory), judge))
         rows.rows += [(encoder_deg, name, *figures_of(parts)) for name, parts in found.items()]

@@ -13,11 +13,13 @@ from torch import Tensor
 
 from torchfovea.arena import Look, Truth, stack
 from torchfovea.deciding.strategies import Strategy
-from torchfovea.episode import Episode, run_episode, run_episodes, stack_minds
+from torchfovea.episode import Episode, run_episode, run_episodes
 from torchfovea.experiments.build import build_arena, build_cells, build_motor, build_scene_of, name_of
+from torchfovea.experiments.memories import loaded_memory
 from torchfovea.experiments.settings import choice, number, whole
 from torchfovea.experiments.strategy import build_stop, build_strategy
-from torchfovea.perception import Mind, Observer, Step, new_mind
+from torchfovea.memory.egosphere import Memory
+from torchfovea.perception import Observer, Step, new_memory
 from torchfovea.sensing.head import Head
 from torchfovea.setting import require
 from torchfovea.sim.arenas import GeometricArenas
@@ -57,11 +59,13 @@ def one_episode(
     """The episode of one seed, with whatever sensor, renderer and motor."""
     generator = torch.Generator().manual_seed(seed)
     arena = build_arena(cfg, observer, seed)
-    mind = new_mind(observer, build_cells(_aimed(cfg, arena.world.scene), observer.head, generator))
-    truth = arena.truth(mind.memory.cells)
+    memory = loaded_memory(cfg, observer)
+    if memory is None:
+        memory = new_memory(observer, build_cells(_aimed(cfg, arena.world.scene), observer.head, generator))
+    truth = arena.truth(memory.cells)
     observer = dataclasses.replace(observer, acquisition=build_strategy(cfg, observer, _aim(truth)))
     return run_episode(
-        observer, mind, arena, truth, whole(cfg, "saccades"), generator, number(cfg, "far_m"),
+        observer, memory, arena, truth, whole(cfg, "saccades"), generator, number(cfg, "far_m"),
         number(cfg, "near_target_m"), each, build_stop(cfg),
     )  # fmt: skip
 
@@ -92,22 +96,24 @@ def _scene(settings: str, head: Head, seed: int) -> Scene:
 
 
 @lru_cache(maxsize=64)
-def _start(settings: str, observer: Observer, seed: int) -> tuple[Mind, Tensor]:
+def _start(settings: str, observer: Observer, seed: int) -> tuple[Memory, Tensor]:
     """The memory of a seed, and where its generator stands after its cells were drawn."""
     generator = torch.Generator().manual_seed(seed)
-    mind = new_mind(observer, build_cells(_settings(settings), observer.head, generator))
-    return mind, generator.get_state()
+    memory = new_memory(observer, build_cells(_settings(settings), observer.head, generator))
+    return memory, generator.get_state()
 
 
-def prepare(cfg: DictConfig, observer: Observer, seed: int) -> tuple[Scene, Mind, Truth, torch.Generator]:
+def prepare(cfg: DictConfig, observer: Observer, seed: int) -> tuple[Scene, Memory, Truth, torch.Generator]:
     """What an episode starts from; scenes and memories are kept for the next call with the same settings."""
     scene = _scene(OmegaConf.to_yaml(OmegaConf.masked_copy(cfg, ["scene", "trust"]), resolve=True), observer.head, seed)
+    generator, memory = torch.Generator().manual_seed(seed), loaded_memory(cfg, observer)
+    if memory is not None:
+        return scene, memory, truth_of(scene, memory.cells), generator
     plain = dataclasses.replace(observer, acquisition=Observer().acquisition)
-    memory = OmegaConf.masked_copy(_aimed(cfg, scene), ["memory"])
-    mind, state = _start(OmegaConf.to_yaml(memory, resolve=True), plain, seed)
-    generator = torch.Generator()
+    cells = OmegaConf.masked_copy(_aimed(cfg, scene), ["memory"])
+    memory, state = _start(OmegaConf.to_yaml(cells, resolve=True), plain, seed)
     generator.set_state(state)
-    return scene, mind, truth_of(scene, mind.memory.cells), generator
+    return scene, memory, truth_of(scene, memory.cells), generator
 
 
 def roll_out(
@@ -127,9 +133,9 @@ def roll_out(
         each: see `torchfovea.episode.run_episodes`.
     """
     parts = [prepare(cfg, observer, seed) for seed in seeds]
-    scenes, minds, truths, generators = (list(part) for part in zip(*parts, strict=True))
+    scenes, memories, truths, generators = (list(part) for part in zip(*parts, strict=True))
     device = device_of(cfg) if "device" in cfg else "cpu"
-    mind = _to(stack_minds(minds), device)
+    memory = _to(stack(memories), device)
     if strategy is None:
         aims = stack([_aim(truth) for truth in truths]).to(device)
         chosen = build_strategy(cfg, observer, aims)
@@ -137,7 +143,7 @@ def roll_out(
         chosen = strategy(truths)
     return run_episodes(
         dataclasses.replace(observer, acquisition=chosen),
-        mind,
+        memory,
         GeometricArenas(scenes, observer, sample_of(cfg), device, build_motor(cfg)(scenes[0]), seeds),
         truths,
         whole(cfg, "saccades"),

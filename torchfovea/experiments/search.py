@@ -16,12 +16,14 @@ from torchfovea.config import run_folder
 from torchfovea.episode import Episode
 from torchfovea.experiments.build import build_match, build_motor, build_observer, build_renderer, name_of
 from torchfovea.experiments.manifest import complete, finished
+from torchfovea.experiments.memories import loaded_memory, memory_path
 from torchfovea.experiments.parallel import spread, workers_of
 from torchfovea.experiments.progress import progress_bar
 from torchfovea.experiments.rollout import batched, device_of, one_episode, roll_out, sample_of
 from torchfovea.experiments.settings import choice, number, whole
 from torchfovea.experiments.strategy import build_stop, build_strategy
 from torchfovea.files import write_csv
+from torchfovea.memory.store import save_memory
 from torchfovea.metrics import phantom
 from torchfovea.perception import Observer, Step
 from torchfovea.setting import require
@@ -49,7 +51,8 @@ def run(cfg: DictConfig) -> float:
     number(cfg, "near_target_m"), build_stop(cfg)
     require(isinstance(cfg.picture, bool), "picture", cfg.picture, "true or false")
     # mistakes come first, also in what is not used
-    build_strategy(cfg, observer), build_match(cfg), build_motor(cfg)
+    build_strategy(cfg, observer), build_match(cfg), build_motor(cfg), loaded_memory(cfg, observer)
+    saved = memory_path(cfg, "memory.save")
     done = finished(cfg, folder)
     if done is not None:
         return done
@@ -71,6 +74,8 @@ def run(cfg: DictConfig) -> float:
     assert last is not None
     if cfg.picture:
         _draw(folder, cfg, observer.retina, last, rows[-1])
+    if saved is not None:
+        save_memory(saved, last.step.memory)
     figures = summarize(rows)
     complete(folder, figures)
     _print(figures)

@@ -22,8 +22,9 @@ from torchfovea.experiments.unread import refuse_unread
 from torchfovea.files import replacing, write_result
 from torchfovea.gaussian import Gaussian
 from torchfovea.sensing.chart import cartesian_from_inverse_range
-from torchfovea.sensing.correspondence import Budget, Correspondences, once_a_pixel
+from torchfovea.sensing.correspondence import Budget, Correspondences
 from torchfovea.sensing.head import Eyes
+from torchfovea.sensing.kinship import once_a_pixel
 from torchfovea.sensing.layout import Retina
 from torchfovea.sensing.triangulation import Observations, observe
 from torchfovea.sensing.unscented import SigmaPoints

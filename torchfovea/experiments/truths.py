@@ -11,8 +11,9 @@ from torch import Tensor
 from torchfovea.experiments.pairs import Pair
 from torchfovea.experiments.regions import REGIONS, regions, truth_step_px
 from torchfovea.sensing.camera import Camera
-from torchfovea.sensing.correspondence import Budget, Correspondences, once_a_pixel
+from torchfovea.sensing.correspondence import Budget, Correspondences
 from torchfovea.sensing.head import Eyes, Gaze, eyes
+from torchfovea.sensing.kinship import once_a_pixel
 from torchfovea.sensing.layout import Retina
 from torchfovea.setting import SettingError
 from torchfovea.sim.world import World

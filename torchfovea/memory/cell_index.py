@@ -128,10 +128,11 @@ def _simple(front: _Frontier, separate: bool, table: bool, budget: int) -> Tenso
 
 
 def unit_cells(cells: Tensor) -> Tensor:
-    """Directions as unit vectors in float64."""
-    largest = cells.detach().abs().amax(-1, keepdim=True)
+    """Directions as unit vectors in float64, the same bits for any memory layout."""
+    cells = cells.detach().contiguous()
+    largest = cells.abs().amax(-1, keepdim=True)
     require(bool(((largest > 0) & (largest < math.inf)).all()), "cells", "zero or not finite", "non-zero directions")
-    p = cells.detach().double() / largest
+    p = cells.double() / largest
     return p / p.norm(dim=-1, keepdim=True)
 
 

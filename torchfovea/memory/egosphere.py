@@ -1,4 +1,4 @@
-"""The sensory ego-sphere: what the observer knows, one Gaussian for each direction cell (Sec. 5).
+"""The memory, a sensory ego-sphere: what the observer knows, one Gaussian for each direction cell (Sec. 5).
 
 In the Cartesian charts a cell holds the point (x, y, z), as printed. In inverse range it holds a *patch*, the plane
 q·X = 1 around its direction p. Seen from E, inverse range is linear in the direction, ρ(u) = q·u, so that observations
@@ -19,25 +19,27 @@ import torch
 from torch import Tensor
 
 from torchfovea.gaussian import Gaussian, Information, columns, gaussian_from_information
+from torchfovea.memory.nearest import CellIndex, build_index, neighbour_spacing_rad
 from torchfovea.setting import require
 
 __all__ = [
-    "EgoSphere",
     "Fusion",
+    "Memory",
     "Prior",
     "belief",
     "blend",
     "cartesian_belief",
     "cartesian_from_patches",
+    "check_chart",
+    "empty_memory",
     "forget",
-    "new_egosphere",
     "prior_information",
     "trust",
 ]
 
 
-class EgoSphere(NamedTuple):
-    """The memory; its size never changes.
+class Memory(NamedTuple):
+    """What is known, and all that it takes to know more; its size never changes. Build it with `empty_memory`.
 
     Attributes:
         cells: unit directions in E, (..., Nx, 3) (Eq. 20).
@@ -47,6 +49,11 @@ class EgoSphere(NamedTuple):
         lasting: (..., Nx, 2), what says how much of a patch's error no further look takes away. With u the variance of
             a look's inverse range and l what of it lasts: the sums over looks of √l/u and of l/u², see `belief`.
         votes: (..., Nx, 2), looks for and against what the cell believes, see `torchfovea.memory.voting`.
+        lookup: finds the cell of a direction.
+        spacing_rad: distance of each cell to its neighbours, (..., Nx).
+        prior: what a cell believes before it is seen.
+        chart: of the information, `inverse_range` or `cartesian`.
+        axis: where the left eye looked last, unit (..., 3) in E; None: there was no look.
     """
 
     cells: Tensor
@@ -55,6 +62,11 @@ class EgoSphere(NamedTuple):
     looks: Tensor
     lasting: Tensor
     votes: Tensor
+    lookup: CellIndex
+    spacing_rad: Tensor
+    prior: Prior
+    chart: str
+    axis: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -140,18 +152,18 @@ def _prior_scalars(cells: Tensor, prior: Prior, chart: str) -> tuple[list[tuple[
 
 
 def prior_information(cells: Tensor, prior: Prior, chart: str = "inverse_range") -> tuple[Information, Tensor]:
-    """What every cell believes at first, and its bearing precision, in the shapes of `EgoSphere`."""
+    """What every cell believes at first, and its bearing precision, in the shapes of `Memory`."""
     zero = torch.zeros_like(cells[..., 0])
     ((x, xx), (y, yy), (z, zz)), bearing = _prior_scalars(cells, prior, chart)
     matrix = columns(zero + xx, zero, zero, zero + yy, zero, zero + zz)
     return Information(columns(zero + x, zero + y, zero + z), matrix), zero + bearing
 
 
-def new_egosphere(cells: Tensor, prior: Prior, chart: str = "inverse_range") -> EgoSphere:
-    """An empty memory.
+def empty_memory(cells: Tensor, prior: Prior, chart: str = "inverse_range") -> Memory:
+    """A memory that has seen nothing, its cells indexed.
 
     Args:
-        cells: unit directions (..., Nx, 3).
+        cells: unit directions (Nx, 3), or of B memories (B, Nx, 3).
         prior: what every cell believes at first.
         chart: of the information, see `Fusion.chart`.
 
@@ -166,12 +178,28 @@ def new_egosphere(cells: Tensor, prior: Prior, chart: str = "inverse_range") -> 
     unit = bool(((cells * cells).sum(-1) - 1).abs().max() < 1e-3)
     require(unit, "cells", "directions", "finite unit vectors")
     zero = torch.zeros_like(cells[..., 0])
-    return EgoSphere(cells, *prior_information(cells, prior, chart), zero, columns(zero, zero), columns(zero, zero))
+    found = build_index(cells), neighbour_spacing_rad(cells)
+    known = prior_information(cells, prior, chart)
+    return Memory(cells, *known, zero, columns(zero, zero), columns(zero, zero), *found, prior, chart)
 
 
-def blend(memory: EgoSphere, prior: Prior, chart: str, keep: Tensor) -> EgoSphere:
+def check_chart(memory: Memory, chart: str, whose: str) -> None:
+    """Refuse what is of another chart than a memory.
+
+    Args:
+        memory: that would take it.
+        chart: of it.
+        whose: the name that the user knows it by.
+
+    Raises:
+        SettingError: where the two differ; it names both.
+    """
+    require(chart == memory.chart, whose, chart, f"{memory.chart}, the chart of the memory")
+
+
+def blend(memory: Memory, keep: Tensor) -> Memory:
     """Keep a share (..., Nx) of what was learned; the rest is the prior's. Differentiable."""
-    first, sure = _prior_scalars(memory.cells, prior, chart)
+    first, sure = _prior_scalars(memory.cells, memory.prior, memory.chart)
     less = 1 - keep
     vector, matrix = ([keep * part for part in parts.unbind(-1)] for parts in memory.information)
     for k, (mean, weight) in enumerate(first):
@@ -183,23 +211,21 @@ def blend(memory: EgoSphere, prior: Prior, chart: str, keep: Tensor) -> EgoSpher
     return memory._replace(information=information, bearing=bearing, lasting=columns(keep * once, keep * keep * twice))
 
 
-def forget(memory: EgoSphere, prior: Prior, chart: str, keep: float | Tensor) -> EgoSphere:
+def forget(memory: Memory, keep: float | Tensor) -> Memory:
     """Let information decay toward the prior.
 
     Args:
         memory: before.
-        prior: what a cell believes that knows nothing.
-        chart: of the memory.
         keep: the share that remains, 0 to 1, broadcastable to (..., Nx); for a half-life of h saccades 0.5^(1/h).
 
     Differentiable. Seen cells stay seen.
     """
     share = torch.as_tensor(keep, dtype=memory.cells.dtype, device=memory.cells.device)
     require(bool(((share >= 0) & (share <= 1)).all()), "keep", keep, "a share from 0 to 1")
-    return blend(memory, prior, chart, share.expand(memory.looks.shape))
+    return blend(memory, share.expand(memory.looks.shape))
 
 
-def belief(memory: EgoSphere) -> Gaussian:
+def belief(memory: Memory) -> Gaussian:
     """Moments in the memory's own coordinates, (..., Nx, 3) and (..., Nx, 6): a point, or a patch (g₁, g₂, ρ).
 
     Looks are averaged with their informations 1/u as weights. Of their variances u the parts l last, so that these err
@@ -211,19 +237,19 @@ def belief(memory: EgoSphere) -> Gaussian:
     return Gaussian(mean, columns(*rest, variance + variance.square() * (once.square() - twice).clamp(min=0)))
 
 
-def trust(memory: EgoSphere) -> Tensor:
+def trust(memory: Memory) -> Tensor:
     """Probability that each cell's surface is there, (..., Nx): the share of votes for it, 0 where unseen."""
     yes, no = memory.votes.unbind(-1)
     return yes / (yes + no).clamp(min=torch.finfo(yes.dtype).tiny)
 
 
-def cartesian_belief(memory: EgoSphere, chart: str) -> Gaussian:
+def cartesian_belief(memory: Memory) -> Gaussian:
     """Moments in 3-D, in E: what information, exports and pictures use. Differentiable."""
     moments = belief(memory)
-    return moments if chart == "cartesian" else cartesian_from_patches(moments, memory)
+    return moments if memory.chart == "cartesian" else cartesian_from_patches(moments, memory)
 
 
-def cartesian_from_patches(moments: Gaussian, memory: EgoSphere, far_m: float = 1000.0) -> Gaussian:
+def cartesian_from_patches(moments: Gaussian, memory: Memory, far_m: float = 1000.0) -> Gaussian:
     """Cartesian moments of the patches' points in their cells' directions, to first order.
 
     Args:

@@ -23,8 +23,15 @@ from torchfovea.gaussian import (
     rotate3,
 )
 from torchfovea.memory.association import gather_columns, in_front
-from torchfovea.memory.egosphere import EgoSphere, Fusion, Prior, belief, new_egosphere, prior_information
-from torchfovea.memory.nearest import CellIndex, build_index, nearest_cell, nearest_observation
+from torchfovea.memory.egosphere import (
+    Fusion,
+    Memory,
+    belief,
+    check_chart,
+    empty_memory,
+    prior_information,
+)
+from torchfovea.memory.nearest import nearest_cell, nearest_observation
 from torchfovea.sensing.chart import basis
 from torchfovea.setting import require
 
@@ -92,7 +99,7 @@ class _Moved(NamedTuple):
         direction: where they are seen, (M, 3).
         bearing: precision across the line of sight (M,).
         looks: (M,).
-        lasting: see `EgoSphere`, relative to the information of the inverse range, (M, 2).
+        lasting: see `Memory`, relative to the information of the inverse range, (M, 2).
         votes: (M, 2).
     """
 
@@ -104,13 +111,13 @@ class _Moved(NamedTuple):
     votes: Tensor
 
 
-def _carry(memory: EgoSphere, step: Motion, chart: str) -> _Moved:
+def _carry(memory: Memory, step: Motion) -> _Moved:
     """Move what was seen; patches whose back the robot would see now are dropped. Float64: planes mix scales."""
     information = Information(*(part.double() for part in memory.information))
     moments = gaussian_from_information(information)
     rotation = step.rotation.mT.to(memory.cells.device)
     shift, noise = step.translation.to(memory.cells.device), step.covariance.to(memory.cells.device)
-    seen = memory.looks > 0
+    seen, chart = memory.looks > 0, memory.chart
     if chart == "inverse_range":
         seen = seen & (moments.mean[..., 2] > 1e-3)
     cells, mean, cov = memory.cells[seen].double(), moments.mean[seen], moments.cov[seen]
@@ -147,9 +154,7 @@ def _carry(memory: EgoSphere, step: Motion, chart: str) -> _Moved:
     return _Moved(Gaussian(state.mean[good], state.cov[good]), *rows)
 
 
-def move(
-    memory: EgoSphere, index: CellIndex, spacing_rad: Tensor, step: Motion, fusion: Fusion, prior: Prior
-) -> EgoSphere:
+def move(memory: Memory, step: Motion, fusion: Fusion) -> Memory:
     """Carry one memory along with the base.
 
     Each seen cell's point or patch is moved with its covariance (the rotation exactly, the odometry's covariance added)
@@ -160,30 +165,29 @@ def move(
 
     Args:
         memory: before, (Nx, 3).
-        index: of its cells.
-        spacing_rad: distance of each cell to its neighbours (Nx,).
         step: from `motion`.
-        fusion: whose chart and conflict hold.
-        prior: of unseen cells.
+        fusion: whose conflict holds.
 
     Returns:
         The memory over the same directions in the new frame. Not differentiable.
 
     Raises:
-        SettingError: for a batch of memories.
+        SettingError: for a batch of memories, or a fusion of another chart.
     """
+    check_chart(memory, fusion.chart, "fusion.chart")
     require(memory.cells.dim() == 2, "cells", tuple(memory.cells.shape), "one memory, a shape (cells, 3)")
-    chart, cells = fusion.chart, memory.cells
-    moved = _carry(memory, step, chart)
-    empty = new_egosphere(cells, prior, chart)
+    cells, spacing_rad = memory.cells, memory.spacing_rad
+    moved, empty = _carry(memory, step), _emptied(memory)
+    if memory.axis is not None:
+        empty = empty._replace(axis=(step.rotation.mT.to(memory.axis) @ memory.axis[:, None])[:, 0])
     if len(moved.looks) == 0:
         return empty
     direction = moved.direction.to(cells)
-    cell, cosine = nearest_cell(index, direction)
+    cell, cosine = nearest_cell(memory.lookup, direction)
     near = torch.acos(cosine.clamp(-1, 1)) <= 1.5 * spacing_rad[cell].clamp(max=math.pi / 2)
     taken = near.nonzero().squeeze(1)
     home = cell[taken]
-    rho, variance = _seen_from(moved, taken, cells[home], chart)
+    rho, variance = _seen_from(moved, taken, cells[home], memory.chart)
     # the outermost patch of a thing ends half a spacing beyond itself: farther it hides nothing, or things would grow
     apart = (direction[taken] - cells[home]).norm(dim=-1)
     hides = apart <= 0.5 * spacing_rad[home]
@@ -201,7 +205,15 @@ def move(
     )
     source = torch.where(free & (cosine > -1), candidate, source)
     got = (source >= 0).nonzero().squeeze(1)
-    return _put(empty, got, moved, source[got], chart)
+    return _put(empty, got, moved, source[got])
+
+
+def _emptied(memory: Memory) -> Memory:
+    """The same cells, unseen."""
+    first, bearing = prior_information(memory.cells, memory.prior, memory.chart)
+    nothing = torch.zeros_like(memory.looks)
+    none = columns(nothing, nothing)
+    return memory._replace(information=first, bearing=bearing, looks=nothing, lasting=none, votes=none)
 
 
 def _seen_from(moved: _Moved, which: Tensor, target: Tensor, chart: str) -> tuple[Tensor, Tensor]:
@@ -213,10 +225,10 @@ def _seen_from(moved: _Moved, which: Tensor, target: Tensor, chart: str) -> tupl
     return 1 / r, quadratic3(cov, mean / r[..., None]) / r**4
 
 
-def _put(empty: EgoSphere, got: Tensor, moved: _Moved, source: Tensor, chart: str) -> EgoSphere:
+def _put(empty: Memory, got: Tensor, moved: _Moved, source: Tensor) -> Memory:
     """Write moved states into cells of an empty memory."""
     mean, cov = moved.state.mean[source], moved.state.cov[source]
-    if chart == "inverse_range":
+    if empty.chart == "inverse_range":
         frame = _frame(empty.cells[got].double())
         mean, cov = (frame @ mean[..., None])[..., 0], rotate3(frame, cov)
     new = information_from_gaussian(Gaussian(mean, cov))
@@ -224,7 +236,8 @@ def _put(empty: EgoSphere, got: Tensor, moved: _Moved, source: Tensor, chart: st
     bearing = _write(empty.bearing, got, moved.bearing[source])
     looks, votes = _write(empty.looks, got, moved.looks[source]), _write(empty.votes, got, moved.votes[source])
     lasting = moved.lasting[source] / columns(cov[..., 5].sqrt(), cov[..., 5])
-    return EgoSphere(empty.cells, information, bearing, looks, _write(empty.lasting, got, lasting), votes)
+    lasting = _write(empty.lasting, got, lasting)
+    return empty._replace(information=information, bearing=bearing, looks=looks, lasting=lasting, votes=votes)
 
 
 def _write(old: Tensor, rows: Tensor, values: Tensor) -> Tensor:
@@ -234,7 +247,7 @@ def _write(old: Tensor, rows: Tensor, values: Tensor) -> Tensor:
     return new
 
 
-def resample(memory: EgoSphere, cells: Tensor, spacing_rad: Tensor, fusion: Fusion, prior: Prior) -> EgoSphere:
+def resample(memory: Memory, cells: Tensor, fusion: Fusion) -> Memory:
     """Carry what is known over to another set of cells, conserving information (Sec. 8).
 
     Every seen cell's information beyond the prior goes to the new cell nearest to it, and to new cells that would stay
@@ -245,23 +258,22 @@ def resample(memory: EgoSphere, cells: Tensor, spacing_rad: Tensor, fusion: Fusi
     Args:
         memory: before, (Nx, 3).
         cells: the new unit directions (Ny, 3).
-        spacing_rad: distance of each *old* cell to its neighbours (Nx,): how far its knowledge reaches.
-        fusion: whose chart and conflict hold.
-        prior: of both memories.
+        fusion: whose conflict holds.
 
     Returns:
         The memory over the new cells. Not differentiable.
 
     Raises:
-        SettingError: for a batch of memories or cells that are not unit directions.
+        SettingError: for a batch of memories, cells that are not unit directions or a fusion of another chart.
     """
+    check_chart(memory, fusion.chart, "fusion.chart")
     require(memory.cells.dim() == 2, "cells", tuple(memory.cells.shape), "one memory, a shape (cells, 3)")
-    chart = fusion.chart
-    empty = new_egosphere(cells, prior, chart)
+    chart, prior, spacing_rad = memory.chart, memory.prior, memory.spacing_rad
+    empty = empty_memory(cells, prior, chart)._replace(axis=memory.axis)
     old = (memory.looks > 0).nonzero().squeeze(1)
     if len(old) == 0:
         return empty
-    target = nearest_cell(build_index(cells), memory.cells[old])[0]
+    target = nearest_cell(empty.lookup, memory.cells[old])[0]
     moments = belief(memory)
     if chart == "inverse_range":
         std = (moments.cov[old, 5] + prior.slope_std**2 * (cells[target] - memory.cells[old]).square().sum(-1)).sqrt()
@@ -288,4 +300,5 @@ def resample(memory: EgoSphere, cells: Tensor, spacing_rad: Tensor, fusion: Fusi
     information = Information(empty.information.vector + total[..., :3], empty.information.matrix + total[..., 3:9])
     looks = empty.looks.scatter_reduce(0, target, gather_columns(memory.looks[:, None], source)[:, 0], "amax")
     lasting, votes = columns(*total[..., 10:12].unbind(-1)), columns(*total[..., 12:].unbind(-1))
-    return EgoSphere(cells, information, empty.bearing + total[..., 9], looks, lasting, votes)
+    bearing = empty.bearing + total[..., 9]
+    return empty._replace(information=information, bearing=bearing, looks=looks, lasting=lasting, votes=votes)

@@ -16,7 +16,15 @@ from torch import Tensor
 from torchfovea.memory.cell_index import SLOTS, CellIndex, build_index, unit_cells
 from torchfovea.setting import require
 
-__all__ = ["CellIndex", "build_index", "join_indices", "nearest_cell", "nearest_observation", "neighbour_spacing_rad"]
+__all__ = [
+    "CellIndex",
+    "build_index",
+    "index_of_set",
+    "join_indices",
+    "nearest_cell",
+    "nearest_observation",
+    "neighbour_spacing_rad",
+]
 
 
 def join_indices(indices: Sequence[CellIndex]) -> CellIndex:
@@ -46,6 +54,30 @@ def join_indices(indices: Sequence[CellIndex]) -> CellIndex:
         indices[0].size,
         len(indices),
     )
+
+
+def index_of_set(index: CellIndex, b: int) -> CellIndex:
+    """The index of one of several sets, without building it again; what is of one set already is returned as it is."""
+    if index.batch is None:
+        return index
+    require(0 <= b < index.batch, "b", b, f"a set's number, 0 to {index.batch - 1}")
+    if index.batch == 1:
+        return index._replace(batch=None)
+    table = 6 * index.resolution**2
+    rows = torch.arange(b * table, (b + 1) * table, device=index.link.device)
+    found = [rows]
+    while len(rows):  # what rows link to, then what that links to
+        link = index.link.index_select(0, rows).long()
+        quarters = link[link > 0][:, None] + torch.arange(4, device=link.device)
+        rows = torch.cat([quarters.flatten(), -link[link < 0]])
+        found.append(rows)
+    kept = torch.cat(found)
+    place = torch.zeros(len(index.link), dtype=index.link.dtype, device=kept.device)
+    place[kept] = torch.arange(len(kept), dtype=place.dtype, device=kept.device)
+    link = index.link.index_select(0, kept)
+    link = link.sign() * place.index_select(0, link.abs())
+    parts = index.vectors.index_select(1, kept), index.cells.index_select(0, kept), link
+    return CellIndex(*parts, index.resolution, index.size, None)
 
 
 def nearest_cell(index: CellIndex, directions: Tensor) -> tuple[Tensor, Tensor]:

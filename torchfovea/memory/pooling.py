@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -17,7 +19,7 @@ class Pooled(NamedTuple):
 
     Attributes:
         information: (..., Nx, 3) and (..., Nx, 6), zero where nothing came.
-        bearing: see `EgoSphere`, (..., Nx).
+        bearing: see `Memory`, (..., Nx).
         hits: number of observations (..., Nx).
     """
 
@@ -26,30 +28,29 @@ class Pooled(NamedTuple):
     hits: Tensor
 
 
-def _sum_up(parts: list[Tensor], cell: Tensor, batch: torch.Size, cells: int) -> Pooled:
+def _sum_up(parts: list[Tensor], cell: Tensor, shape: Sequence[int]) -> Pooled:
     """Add up ten or eleven components (M,): vector, matrix, perhaps bearing, count."""
     rows = torch.stack(parts)
-    total = torch.zeros(len(parts), batch.numel() * cells, dtype=rows.dtype, device=rows.device)
+    total = torch.zeros(len(parts), math.prod(shape), dtype=rows.dtype, device=rows.device)
     total = total.scatter_add(1, cell.expand(len(parts), -1), rows)
-    total = total.reshape(len(parts), *batch, cells).movedim(0, -1)
+    total = total.reshape(len(parts), *shape).movedim(0, -1)
     bearing = total[..., 9] if len(parts) == 11 else torch.zeros_like(total[..., 9])
     return Pooled(Information(total[..., :3], total[..., 3:9]), bearing, total[..., -1])
 
 
-def pool(gaussian: Gaussian, cell: Tensor, batch: torch.Size, cells: int) -> Pooled:
+def pool(gaussian: Gaussian, cell: Tensor, shape: Sequence[int]) -> Pooled:
     """Add up the information of one saccade's points, cell by cell (Eq. 34-35 without the memory).
 
     Args:
         gaussian: (M, 3) and (M, 6), points in E.
         cell: (M,) int64, counted through all batches.
-        batch: leading axes of the memory.
-        cells: Nx.
+        shape: of the memory, (..., Nx).
 
     Differentiable in the Gaussians.
     """
     vector, matrix = information_from_gaussian(gaussian)
     parts = [*vector.unbind(-1), *matrix.unbind(-1), torch.ones_like(vector[..., 0])]
-    return _sum_up(parts, cell, batch, cells)
+    return _sum_up(parts, cell, shape)
 
 
 def pool_patches(
@@ -59,8 +60,7 @@ def pool_patches(
     row: Tensor,
     keep: Tensor,
     cell: Tensor,
-    batch: torch.Size,
-    cells: int,
+    shape: Sequence[int],
 ) -> Pooled:
     """Add up the information of one saccade's inverse ranges about the patches that they fall on.
 
@@ -71,8 +71,7 @@ def pool_patches(
         row: their directions in their cells' frames (e₁, e₂, p), (M, 3).
         keep: how often each counts, 1 or 0, (M,).
         cell: (M,) int64, counted through all batches.
-        batch: leading axes of the memory.
-        cells: Nx.
+        shape: of the memory, (..., Nx).
 
     Differentiable in all but the cells.
     """
@@ -80,12 +79,10 @@ def pool_patches(
     weight = keep / variance
     wx, wy, wz = weight * x, weight * y, weight * z
     parts = [wx * rho, wy * rho, wz * rho, wx * x, wx * y, wx * z, wy * y, wy * z, wz * z, keep * bearing]
-    return _sum_up([*parts, keep], cell, batch, cells)
+    return _sum_up([*parts, keep], cell, shape)
 
 
-def share_errors(
-    pooled: Pooled, precision: Tensor, patches: Tensor, shared: float, lasting: Tensor | float
-) -> tuple[Pooled, Tensor]:
+def share_errors(pooled: Pooled, precision: Tensor, patches: Tensor, shared: float) -> tuple[Pooled, Tensor]:
     """Count what a look's fields have in common: their errors do not average out as if each erred by itself.
 
     Fields of variances v, weighted by 1/v, share c = r/(1 + D) of each variance over a cell that D patches of common
@@ -94,24 +91,21 @@ def share_errors(
 
     Args:
         pooled: from `pool_patches`.
-        precision: Λ and s, (..., Nx, 2).
+        precision: Λ, s and Σ √(l/v) with the shares l of their variances that last between looks, (..., Nx, 3).
         patches: D, (..., Nx).
         shared: r.
-        lasting: the share of v that looks at the same surface have in common, at most r; broadcastable to (..., Nx).
 
     Returns:
         The pooled observations with their true information, and the variance of inverse range that lasts (..., Nx).
         Differentiable.
     """
-    total, root = precision.unbind(-1)
-    seen = total > 0
-    spread = 1 / (1 + patches)
+    total, *roots = precision.unbind(-1)
+    seen, spread = total > 0, 1 / (1 + patches)
+    common, lasting = (torch.where(seen, root / torch.where(seen, total, 1.0), 0.0).square() for root in roots)
     share = shared * spread
-    square = torch.where(seen, root / torch.where(seen, total, 1.0), 0.0).square()
     own = 1 / (1 - share)
-    information = Information(*(own[..., None] * part for part in pooled.information))
-    information = _with_common(information, share * square)
-    return Pooled(information, pooled.bearing, pooled.hits), lasting * spread * square
+    information = _with_common(Information(*(own[..., None] * part for part in pooled.information)), share * common)
+    return Pooled(information, pooled.bearing, pooled.hits), spread * lasting
 
 
 def _with_common(information: Information, variance: Tensor) -> Information:

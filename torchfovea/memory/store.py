@@ -3,65 +3,99 @@
 from __future__ import annotations
 
 import os
-import zipfile
+from dataclasses import astuple, fields
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from torchfovea.files import replacing
 from torchfovea.gaussian import Information, columns, positive_definite
-from torchfovea.memory.egosphere import EgoSphere
+from torchfovea.memory.egosphere import Memory, Prior, empty_memory
 from torchfovea.setting import SettingError, require
 
-__all__ = ["load_memory", "save_memory"]
+__all__ = ["check_memory_path", "load_memory", "save_memory"]
 
-_PARTS = ("cells", "vector", "matrix", "bearing", "looks", "lasting", "votes")
+# of the tensors that are kept as they are; the index and the spacing follow from the cells
+_ENDS = {"cells": (3,), "vector": (3,), "matrix": (6,), "bearing": (), "looks": (), "lasting": (2,), "votes": (2,)}
 
 
-def save_memory(path: str | os.PathLike[str], memory: EgoSphere, chart: str) -> None:
-    """Write a memory; the file appears whole or not at all.
+def check_memory_path(path: str | os.PathLike[str], setting: str = "path") -> None:
+    """Refuse a path that `save_memory` could not write to, before the work is done.
+
+    Raises:
+        SettingError: for another suffix than .npz, or a folder that is not there.
+    """
+    folder = os.path.dirname(os.path.abspath(path))
+    good = str(path).endswith(".npz") and os.path.isdir(folder)
+    require(good, setting, path, "a name that ends in .npz, in a folder that exists")
+
+
+def save_memory(path: str | os.PathLike[str], memory: Memory) -> None:
+    """Write a memory with all that it owns; the file appears whole or not at all.
 
     Args:
         path: ending in .npz.
-        memory: any shape, float32 or float64.
-        chart: that the memory is kept in, see `torchfovea.memory.egosphere.Fusion.chart`.
+        memory: one or a batch, float32 or float64.
 
     Raises:
-        SettingError: for another suffix or an unknown chart.
+        SettingError: for another suffix, or a folder that is not there.
     """
-    require(str(path).endswith(".npz"), "path", path, "a name that ends in .npz")
-    require(chart in ("inverse_range", "cartesian"), "chart", chart, "inverse_range or cartesian")
+    check_memory_path(path)
     parts = (memory.cells, *memory.information, memory.bearing, memory.looks, memory.lasting, memory.votes)
-    arrays: dict[str, Any] = {n: part.detach().cpu().numpy() for n, part in zip(_PARTS, parts, strict=True)}
-    arrays["chart"] = np.array(chart)
+    arrays: dict[str, Any] = {n: part.detach().cpu().numpy() for n, part in zip(_ENDS, parts, strict=True)}
+    arrays["prior"] = np.array(astuple(memory.prior), dtype=np.float64)
+    arrays["chart"] = np.array(memory.chart)
+    if memory.axis is not None:
+        arrays["axis"] = memory.axis.detach().cpu().numpy()
     with replacing(path) as temporary:
         np.savez_compressed(temporary, **arrays)
 
 
-def load_memory(path: str | os.PathLike[str]) -> tuple[EgoSphere, str]:
-    """Read a memory back, bit by bit as it was.
+def load_memory(path: str | os.PathLike[str], setting: str = "path") -> Memory:
+    """Read a memory back, bit by bit as it was, on the CPU; it needs nothing else to go on.
 
-    Returns:
-        The memory, on the CPU, and its chart.
+    Args:
+        path: from `save_memory`.
+        setting: the name that the user knows the path by.
 
     Raises:
         SettingError: for a file that is missing, damaged or no memory.
     """
     try:
         with open(path, "rb") as handle, np.load(handle, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in (*_PARTS, "chart")}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise SettingError(f"path = {path}: expected a memory saved by torchfovea ({error})") from error
-    chart = str(arrays.pop("chart"))
-    parts = {name: torch.from_numpy(array) for name, array in arrays.items()}
+            arrays = {name: file[name] for name in file.files}
+        parts = {name: torch.from_numpy(arrays[name]) for name in _ENDS}
+        names = (field.name for field in fields(Prior))
+        prior = Prior(**{name: float(number) for name, number in zip(names, arrays["prior"], strict=True)})
+        axis = torch.from_numpy(arrays["axis"]) if "axis" in arrays else None
+        _check(parts, axis)
+        columnar = {name: columns(*parts[name].unbind(-1)) for name, end in _ENDS.items() if end}
+        empty = empty_memory(columnar["cells"], prior, str(arrays["chart"]))
+    except Exception as error:  # a damaged file fails in as many ways as there are layers below
+        raise SettingError(f"{setting} = {path}: expected a memory saved by torchfovea ({error})") from error
+    return empty._replace(
+        information=Information(columnar["vector"], columnar["matrix"]),
+        bearing=parts["bearing"],
+        looks=parts["looks"],
+        lasting=columnar["lasting"],
+        votes=columnar["votes"],
+        axis=axis,
+    )
+
+
+def _check(parts: dict[str, Tensor], axis: Tensor | None) -> None:
+    """Raise SettingError unless these can be a memory."""
     shape = parts["cells"].shape[:-1]
-    ends = {"cells": (3,), "vector": (3,), "matrix": (6,), "bearing": (), "looks": (), "lasting": (2,), "votes": (2,)}
-    good = chart in ("inverse_range", "cartesian") and all(parts[n].shape == (*shape, *e) for n, e in ends.items())
-    good = good and all(p.is_floating_point() and bool(torch.isfinite(p).all()) for p in parts.values())
-    good = good and len(shape) > 0 and bool(positive_definite(parts["matrix"], 0.0).all())
-    require(good, "path", path, "a memory saved by torchfovea")
-    columnar = {name: columns(*parts[name].unbind(-1)) for name, end in ends.items() if end}
-    information = Information(columnar["vector"], columnar["matrix"])
-    known = parts["bearing"], parts["looks"], columnar["lasting"], columnar["votes"]
-    return EgoSphere(columnar["cells"], information, *known), chart
+    every = [*parts.values(), *([] if axis is None else [axis])]
+    good = all(parts[name].shape == (*shape, *end) for name, end in _ENDS.items())
+    good = good and len(shape) > 0 and (axis is None or axis.shape == (*shape[:-1], 3))
+    require(good, "shapes", [tuple(part.shape) for part in every], "those of one set of cells")
+    kind = parts["cells"].dtype
+    good = kind in (torch.float32, torch.float64) and all(part.dtype == kind for part in every)
+    good = good and all(bool(torch.isfinite(part).all()) for part in every)
+    require(good, "values", "of several kinds or not finite", "finite numbers of one kind")
+    counted = (parts[name] for name in ("bearing", "looks", "votes"))
+    good = all(bool((part >= 0).all()) for part in counted) and bool(positive_definite(parts["matrix"], 0.0).all())
+    require(good, "values", "negative counts or no covariance", "a memory's")

@@ -15,12 +15,11 @@ from torch import Tensor
 
 from torchfovea.gaussian import Gaussian, Information, columns
 from torchfovea.memory.association import Pairs, associate, gather_columns
-from torchfovea.memory.egosphere import EgoSphere, Fusion, Prior, belief, blend, forget
-from torchfovea.memory.nearest import CellIndex
+from torchfovea.memory.egosphere import Fusion, Memory, Prior, belief, blend, check_chart, forget
 from torchfovea.memory.pooling import Pooled, add_common, found_points, nearness, pool, pool_patches, share_errors
 from torchfovea.memory.voting import cast, see
 from torchfovea.sensing.chart import turn_cartesian
-from torchfovea.sensing.correspondence import Kinship
+from torchfovea.sensing.kinship import Kinship
 from torchfovea.sensing.triangulation import Observations
 
 __all__ = ["Common", "fuse", "remember"]
@@ -29,13 +28,13 @@ Common = Tensor | Callable[[Tensor], Tensor]
 """Packed covariance (..., Nx, 6) that a saccade's observations share, or a function of their points (..., Nx, 3)."""
 
 
-def fuse(memory: EgoSphere, pooled: Pooled, lasting: Tensor | None = None) -> EgoSphere:
+def fuse(memory: Memory, pooled: Pooled, lasting: Tensor | None = None) -> Memory:
     """Join one saccade's pooled observations with the memory (Eq. 34-35).
 
     Args:
         memory: before.
         pooled: what a look tells.
-        lasting: what to add to `EgoSphere.lasting`, (..., Nx, 2); None: nothing.
+        lasting: what to add to `Memory.lasting`, (..., Nx, 2); None: nothing.
 
     Differentiable.
     """
@@ -49,75 +48,73 @@ def fuse(memory: EgoSphere, pooled: Pooled, lasting: Tensor | None = None) -> Eg
 
 
 def remember(
-    memory: EgoSphere,
-    index: CellIndex,
-    spacing_rad: Tensor,
+    memory: Memory,
     observed: Observations,
     fusion: Fusion,
-    prior: Prior,
     common: Common | None = None,
     kin: Kinship | None = None,
-) -> EgoSphere:
+) -> Memory:
     """Enter one saccade's observations: associate (Eq. 22-23), vote, pool, add, fuse (Eq. 34-35).
 
     Args:
-        memory: the ego-sphere before.
-        index: of its cells, from `torchfovea.memory.nearest.build_index`.
-        spacing_rad: distance of each cell to its neighbours (..., Nx).
-        observed: in the fusion's chart; see `associate` for what is left out.
-        fusion: how.
-        prior: what the memory began with.
+        memory: before.
+        observed: in the memory's chart; see `associate` for what is left out.
+        fusion: how, in the memory's chart.
         common: see `add_common`; a function of the points that the saccade found, see `torchfovea.memory.encoders`.
         kin: what the observations' errors have in common; None: nothing. Patches only.
 
     Returns:
-        The ego-sphere after, in the dtype of the one before. Differentiable in the observations (the association and
+        The memory after, in the dtype of the one before. Differentiable in the observations (the association and
         which of them agree are held fixed).
+
+    Raises:
+        SettingError: for observations or a fusion of another chart than the memory's.
     """
-    cells, chart = memory.cells, fusion.chart
+    check_chart(memory, observed.chart, "observed.chart")
+    check_chart(memory, fusion.chart, "fusion.chart")
+    cells = memory.cells
     observed = _like(cells, observed)
     if fusion.half_life < math.inf:
-        memory = forget(memory, prior, chart, 0.5 ** (1 / fusion.half_life))
+        memory = forget(memory, 0.5 ** (1 / fusion.half_life))
     gate_rad = math.radians(fusion.gate_deg)
-    pairs = associate(cells, index, spacing_rad, observed, gate_rad, fusion.gate_spacing, fusion.fill)
-    if chart == "cartesian":
-        return _remember_points(memory, observed, pairs, fusion, prior, common)
-    return _remember_patches(memory, observed, pairs, fusion, prior, common, kin)
+    pairs = associate(cells, memory.lookup, memory.spacing_rad, observed, gate_rad, fusion.gate_spacing, fusion.fill)
+    if memory.chart == "cartesian":
+        return _remember_points(memory, observed, pairs, fusion, common)
+    return _remember_patches(memory, observed, pairs, fusion, common, kin)
 
 
 def _like(cells: Tensor, observed: Observations) -> Observations:
     """Observations in the cells' dtype."""
     mean, cov, direction, support = (part.to(cells.dtype) for part in observed[:4])
     inlier = None if observed.inlier is None else observed.inlier.to(cells.dtype)
-    return Observations(mean, cov, direction, support, observed.valid, inlier)
+    return Observations(mean, cov, direction, support, observed.valid, inlier, observed.chart)
 
 
 def _remember_points(
-    memory: EgoSphere, observed: Observations, pairs: Pairs, fusion: Fusion, prior: Prior, common: Common | None
-) -> EgoSphere:
+    memory: Memory, observed: Observations, pairs: Pairs, fusion: Fusion, common: Common | None
+) -> Memory:
     """The paper's way; every observation is believed."""
     cells = memory.cells
     gaussian = Gaussian(*(gather_columns(part, pairs.observation) for part in (observed.mean, observed.cov)))
     if fusion.name == "aligned":
         direction = gather_columns(observed.direction, pairs.observation)
         gaussian = turn_cartesian(gaussian, direction, gather_columns(cells, pairs.cell))
-    pooled = pool(gaussian, pairs.cell, cells.shape[:-2], cells.shape[-2])
-    pooled = _add(pooled, cells, "cartesian", prior, common)
+    pooled = pool(gaussian, pairs.cell, cells.shape[:-1])
+    pooled = _add(pooled, memory, common)
     yes, no = memory.votes.unbind(-1)
     return fuse(memory._replace(votes=columns(yes + (pooled.hits > 0), no)), pooled)
 
 
 def _remember_patches(
-    memory: EgoSphere,
+    memory: Memory,
     observed: Observations,
     pairs: Pairs,
     fusion: Fusion,
-    prior: Prior,
     common: Common | None,
     kin: Kinship | None,
-) -> EgoSphere:
+) -> Memory:
     """Inverse ranges about patches, of which a cell believes the one that most looks speak for."""
-    cells, batch, count = memory.cells, memory.cells.shape[:-2], memory.cells.shape[-2]
+    cells, prior = memory.cells, memory.prior
     sight = see(observed, pairs, cells, prior.slope_std)
     ballot = cast(
         sight,
@@ -127,16 +124,21 @@ def _remember_patches(
         (prior.mean, prior.std, prior.slope_std),
         (fusion.conflict, fusion.window, fusion.nearest_m),
     )
-    memory = blend(memory, prior, "inverse_range", (~ballot.anew).to(cells.dtype))._replace(votes=ballot.votes)
-    pooled = pool_patches(sight.rho, sight.variance, sight.bearing, sight.row, ballot.keep, sight.cell, batch, count)
+    memory = blend(memory, (~ballot.anew).to(cells.dtype))._replace(votes=ballot.votes)
+    pooled = pool_patches(
+        sight.rho, sight.variance, sight.bearing, sight.row, ballot.keep, sight.cell, cells.shape[:-1]
+    )
     lasting = None
     if kin is not None:
-        patch = kin.patch.to(ballot.keep).reshape(-1).index_select(0, pairs.observation)
-        parts = torch.stack([1 / sight.variance, sight.variance.rsqrt(), patch]) * ballot.keep
-        sums = parts.new_zeros(3, batch.numel() * count).scatter_add(1, sight.cell.expand(3, -1), parts)
-        total, root, patches = sums.reshape(3, *batch, count)
-        pooled, lasting = share_errors(pooled, columns(total, root), patches, kin.shared, kin.lasting)
-    pooled = _add(pooled, cells, "inverse_range", prior, common)
+        patch, lasts = (
+            part.to(ballot.keep).reshape(-1).index_select(0, pairs.observation) for part in (kin.patch, kin.lasting)
+        )
+        root = sight.variance.rsqrt()
+        parts = torch.stack([root.square(), root, root * lasts.sqrt(), patch]) * ballot.keep
+        sums = parts.new_zeros(4, pooled.hits.numel()).scatter_add(1, sight.cell.expand(4, -1), parts)
+        *precision, patches = sums.reshape(4, *pooled.hits.shape)
+        pooled, lasting = share_errors(pooled, columns(*precision), patches, kin.shared)
+    pooled = _add(pooled, memory, common)
     if lasting is not None:
         weight = torch.where(pooled.hits > 0, 1 / _variance(pooled, prior), 0.0)
         lasting = columns(weight * torch.where(lasting > 0, lasting, 1.0).sqrt() * (lasting > 0), weight**2 * lasting)
@@ -149,9 +151,10 @@ def _variance(pooled: Pooled, prior: Prior) -> Tensor:
     return nearness(pooled.information, prior.slope_std**-2, (pooled.hits == 0).to(pooled.hits))[1]
 
 
-def _add(pooled: Pooled, cells: Tensor, chart: str, prior: Prior, common: Common | None) -> Pooled:
+def _add(pooled: Pooled, memory: Memory, common: Common | None) -> Pooled:
     if common is None:
         return pooled
+    cells, chart, slope_std = memory.cells, memory.chart, memory.prior.slope_std
     if callable(common):
-        common = common(found_points(pooled, cells, chart, prior.slope_std))
-    return add_common(pooled, common.to(cells.dtype), chart, prior.slope_std)
+        common = common(found_points(pooled, cells, chart, slope_std))
+    return add_common(pooled, common.to(cells.dtype), chart, slope_std)

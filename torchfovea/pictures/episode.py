@@ -126,7 +126,7 @@ def draw_episode(path: Path, episode: Episode, retina: Retina, title: str) -> No
         for axes in row:
             axes.set_xticks([])
             axes.set_yticks([])
-    memory, points = episode.step.mind.memory, episode.step.points
+    memory, points = episode.step.memory, episode.step.points
     seen = memory.looks > 0
     row = next(parts).subplots(1, 2)
     distance = torch.where(seen, points.mean.norm(dim=-1), torch.nan)

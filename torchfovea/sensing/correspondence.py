@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import ClassVar, NamedTuple
 
@@ -18,12 +19,10 @@ __all__ = [
     "Clues",
     "Correspondences",
     "Disparity",
-    "Kinship",
     "doubt",
+    "edge_doubt",
     "eye_sigma_px",
     "inlier_share",
-    "kinship",
-    "once_a_pixel",
 ]
 
 
@@ -38,6 +37,9 @@ class Correspondences(NamedTuple):
         valid: bool (..., N).
         inlier: (..., N), probability that the two places show one point at all, by what the matcher knows of this pair;
             None: certain.
+        support_px: (..., N), half the width that the left RF stands for [px]: its own, and more where only some of the
+            RFs were looked through; None: its own, by the retina.
+        lasting: (..., N), share of the variance that another look at the same surface repeats; None: the budget's.
     """
 
     left_px: Tensor
@@ -46,12 +48,14 @@ class Correspondences(NamedTuple):
     right_sigma_px: Tensor
     valid: Tensor
     inlier: Tensor | None = None
+    support_px: Tensor | None = None
+    lasting: Tensor | None = None
 
     def take(self, index: int | Tensor) -> Correspondences:
         """Every part at an index of the first axis: some receptive fields (N,), or one row of a batch (B, N)."""
         left_px, right_px, left_sigma, right_sigma, valid = (part[index] for part in self[:5])
-        inlier = None if self.inlier is None else self.inlier[index]
-        return Correspondences(left_px, right_px, left_sigma, right_sigma, valid, inlier)
+        more = (None if part is None else part[index] for part in self[5:])
+        return Correspondences(left_px, right_px, left_sigma, right_sigma, valid, *more)
 
 
 class Disparity(NamedTuple):
@@ -119,21 +123,6 @@ class Clues(NamedTuple):
         return Clues(self.bend_px[index], self.gap_px[index], *more)
 
 
-class Kinship(NamedTuple):
-    """What the errors of one look's receptive fields have in common; `kinship` makes it from a budget.
-
-    Attributes:
-        patch: share of a patch of common error that each receptive field covers, (..., N).
-        shared: share of the variance that fields of one patch have in common.
-        lasting: share of the variance that other looks at the same surface have in common with this one; a number, or
-            (..., 1).
-    """
-
-    patch: Tensor
-    shared: float
-    lasting: Tensor | float
-
-
 @dataclass(frozen=True)
 class Budget:
     """What limits a correspondence, as variances that add up, and how probably it is one at all.
@@ -170,7 +159,7 @@ class Budget:
         shared_px: see `shared` [source px].
         shared_widths: see `shared` [widths of the receptive field].
         lasting: share of the variance that another look at the same patch of surface has in common with this one; 0:
-            independent, as in the paper. Never more than `shared`.
+            independent, as in the paper. Never more than `shared`. What bends, holes and rims make of it lasts wholly.
     """
 
     sigma_over_width: float = 1 / 6
@@ -236,37 +225,27 @@ def eye_sigma_px(budget: Budget, retina: Retina, px: Tensor, clues: Clues | None
     return square.sqrt()
 
 
-def kinship(budget: Budget, retina: Retina, px: Tensor, looked_through: float = 1.0) -> Kinship | None:
-    """What the errors of receptive fields at places (..., N, 2) of a retina share, by a budget; None: nothing.
-
-    Correlation falls off as exp(−distance/ℓ), ℓ = max(`shared_px` source pixels, `shared_widths` widths), so that a
-    patch of common error has the area 2πℓ².
-
-    Args:
-        budget: its terms `shared` and `lasting`.
-        retina: the layout.
-        px: where the receptive fields are [retinal px].
-        looked_through: the share of all receptive fields that these are.
-    """
-    if budget.shared == 0:
-        return None
-    width = retina.width_px(px)
-    source = 0.0 if budget.source_px is None else 2 * retina.radius_px / budget.source_px
-    length = (budget.shared_widths * width).clamp(min=max(budget.shared_px * source, 1e-6))
-    patch = (width.square() / (2 * math.pi * looked_through * length.square())).clamp(max=1)
-    return Kinship(patch, budget.shared, budget.lasting)
-
-
 def doubt(budget: Budget, clues: Clues) -> Tensor:
     """The variance that the clues (...) add in each eye [source px²]. Differentiable."""
-    parts = (
-        (budget.bend, clues.bend_px), (budget.gap, clues.gap_px), (budget.fringe, clues.fringe_px),
-        (budget.noise, clues.noise_px),
-    )  # fmt: skip
-    square = torch.zeros_like(clues.bend_px)
-    for factor, clue in parts:
-        square = square if clue is None else square + (factor * clue).square()
-    return square
+    return _square_of(
+        (
+            (budget.bend, clues.bend_px),
+            (budget.gap, clues.gap_px),
+            (budget.fringe, clues.fringe_px),
+            (budget.noise, clues.noise_px),
+        )
+    )
+
+
+def edge_doubt(budget: Budget, clues: Clues) -> Tensor:
+    """The part of `doubt` that tells of depth edges: bends, holes and rims (...) [source px²]. Differentiable."""
+    return _square_of(((budget.bend, clues.bend_px), (budget.gap, clues.gap_px), (budget.fringe, clues.fringe_px)))
+
+
+def _square_of(parts: Sequence[tuple[float, Tensor | None]]) -> Tensor:
+    """Sum of squares of factors times clues, where there are any; the first is."""
+    squares = [(factor * clue).square() for factor, clue in parts if clue is not None]
+    return torch.stack(squares).sum(0)
 
 
 def inlier_share(budget: Budget, clues: Clues) -> Tensor:
@@ -280,29 +259,3 @@ def inlier_share(budget: Budget, clues: Clues) -> Tensor:
     if clues.mismatch is not None:
         odds = odds * (budget.outliers_mismatch * clues.mismatch).exp()
     return 1 / (1 + odds)
-
-
-def once_a_pixel(px: Tensor, pixel_px: float, valid: Tensor) -> Tensor:
-    """Receptive fields that do not copy another's pixel: of those on one source pixel, the one nearest to its middle.
-
-    Fields narrower than a source pixel read the same few pixels; taken for as many observations, they would count one
-    error dozens of times.
-
-    Args:
-        px: (N, 2), the fields' centres [retinal px].
-        pixel_px: side of a source pixel [retinal px].
-        valid: bool (N,), which fields to choose from.
-
-    Returns:
-        bool (N,), those chosen.
-    """
-    at = px.detach().double() / pixel_px
-    cell = at.round()
-    _, group = torch.unique(cell, dim=0, return_inverse=True)
-    away = torch.where(valid, (at - cell).square().sum(-1), math.inf)
-    count = int(group.max()) + 1 if len(group) else 0
-    nearest = away.new_full((count,), math.inf).scatter_reduce(0, group, away, "amin")
-    order = torch.arange(len(px), device=px.device)
-    best = torch.where(valid & (away == nearest[group]), order, len(px))
-    first = order.new_full((count,), len(px)).scatter_reduce(0, group, best, "amin")
-    return valid & (order == first[group])

@@ -52,7 +52,8 @@ def correspond_points(
         noise = _noise(valid.shape, generator, points)
         left_px = left_px + columns(left_sigma * noise[0], left_sigma * noise[1])
         right_px = right_px + columns(right_sigma * noise[2], right_sigma * noise[3])
-    return Correspondences(left_px, right_px, left_sigma, right_sigma, valid, torch.ones_like(left_sigma))
+    support, sure = retina.width_px(left_px) / 2, torch.ones_like(left_sigma)
+    return Correspondences(left_px, right_px, left_sigma, right_sigma, valid, sure, support)
 
 
 def _noise(shape: torch.Size, generator: torch.Generator | Sequence[torch.Generator], like: Tensor) -> Tensor:

@@ -39,6 +39,7 @@ class Observations(NamedTuple):
         support_rad: half the width that the receptive field covers, seen from the eye, (..., N).
         valid: bool (..., N); the others are finite but mean nothing.
         inlier: (..., N), see `torchfovea.sensing.correspondence.Correspondences`; None: certain.
+        chart: `inverse_range` or `cartesian`; a memory takes those of its own.
     """
 
     mean: Tensor
@@ -47,6 +48,7 @@ class Observations(NamedTuple):
     support_rad: Tensor
     valid: Tensor
     inlier: Tensor | None = None
+    chart: str = "inverse_range"
 
 
 def _turned(rotation: Tensor, vector: Components) -> Components:
@@ -207,7 +209,7 @@ def observe(
     support = support_px / camera.focal_px * torch.addcmul(torch.addcmul(z * z, x, x), y, y).rsqrt()
     mean, cov = value[:3].movedim(0, -1), value[3:].movedim(0, -1)
     inlier = valid.to(mean.dtype) if matches.inlier is None else matches.inlier
-    return Observations(mean, cov, direction.movedim(0, -1), support.expand(valid.shape), valid, inlier)
+    return Observations(mean, cov, direction.movedim(0, -1), support.expand(valid.shape), valid, inlier, chart)
 
 
 def _safe(

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchfovea.arena import Fixation, Look, Move, Truth
 from torchfovea.perception import Observer
 from torchfovea.sensing.correspondence import Disparity
+from torchfovea.sensing.fields import draw_fields, for_all
 from torchfovea.sensing.geometric import correspond_points
 from torchfovea.sensing.head import Gaze, eyes
 from torchfovea.sim.truth import truth_of
@@ -20,7 +21,7 @@ from torchfovea.stereo.rig import verged
 from torchfovea.stereo.sweep import SweepRange
 from torchfovea.stereo.views import verged_views
 
-__all__ = ["Arena", "Pictures", "draw_fields"]
+__all__ = ["Arena", "Pictures"]
 
 
 class Pictures(NamedTuple):
@@ -88,7 +89,7 @@ class Arena:
             matches, found = checked_matches(self.matcher(views, observer.retina, observer.budget), observer.retina)
             chosen = draw_fields(observer.retina.count, self.sample, generator)
             if chosen is not None:
-                matches = matches.take(chosen)
+                matches = for_all(matches.take(chosen), observer.retina)
             return Look(matches, Pictures(left.image, right.image, found))
         left_px = observer.retina.centers_px(dtype=gaze.pan.dtype)
         chosen = draw_fields(observer.retina.count, self.sample, generator)
@@ -97,21 +98,11 @@ class Arena:
         seen = self.world.correspond(gaze, observer.camera.rays(left_px))
         visible = seen.hit & seen.visible_right
         pose = eyes(observer.head, gaze)
-        return Look(
-            correspond_points(
-                seen.points_e, visible, left_px, pose, observer.camera, observer.retina, observer.budget, generator
-            )
+        matches = correspond_points(
+            seen.points_e, visible, left_px, pose, observer.camera, observer.retina, observer.budget, generator
         )
+        return Look(matches if chosen is None else for_all(matches, observer.retina))
 
     def truth(self, cells: Tensor) -> Truth:
         """What the judge knows: the nearest point, and the surface behind every memory cell (Nx, 3)."""
         return truth_of(self.world.scene, cells)
-
-
-def draw_fields(count: int, sample: int | None, generator: torch.Generator) -> Tensor | None:
-    """Some of `count` receptive fields, each with the same chance, in ascending order; None: all of them."""
-    if sample is None or sample >= count:
-        return None
-    chosen = torch.zeros(count, dtype=torch.bool, device=generator.device)
-    chosen[torch.randperm(count, generator=generator, device=generator.device)[:sample]] = True
-    return chosen.nonzero()[:, 0].cpu()

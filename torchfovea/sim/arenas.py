@@ -10,10 +10,10 @@ from torch import Tensor
 
 from torchfovea.arena import Fixation, Look, Move
 from torchfovea.perception import Observer
+from torchfovea.sensing.fields import draw_fields, for_all
 from torchfovea.sensing.geometric import correspond_points
 from torchfovea.sensing.head import Gaze, clamp_gaze, cyclopean, eyes, to_ego
 from torchfovea.setting import require
-from torchfovea.sim.arena import draw_fields
 from torchfovea.sim.model import Scene
 from torchfovea.sim.motor import InstantMotor, Motor
 from torchfovea.sim.room import FLOOR, TARGET
@@ -94,14 +94,14 @@ class GeometricArenas:
         pose = eyes(observer.head, gaze)
         left_px = observer.retina.centers_px(device, gaze.pan.dtype)
         chosen = [draw_fields(observer.retina.count, self.sample, generator) for generator in generators]
-        if any(index is not None for index in chosen):
+        some = any(index is not None for index in chosen)
+        if some:
             left_px = left_px[torch.stack([index for index in chosen if index is not None]).to(device)]
         points, visible = self._surfaces(gaze, observer.camera.rays(left_px))
-        return Look(
-            correspond_points(
-                points, visible, left_px, pose, observer.camera, observer.retina, observer.budget, generators
-            )
+        matches = correspond_points(
+            points, visible, left_px, pose, observer.camera, observer.retina, observer.budget, generators
         )
+        return Look(for_all(matches, observer.retina) if some else matches)
 
     def _surfaces(self, gaze: Gaze, left_rays: Tensor) -> tuple[Tensor, Tensor]:
         """What each left ray meets, and whether the right eye sees it; see `torchfovea.sim.world.World.correspond`."""

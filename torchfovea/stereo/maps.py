@@ -21,6 +21,7 @@ from torchfovea.sensing.correspondence import (
     eye_sigma_px,
     inlier_share,
 )
+from torchfovea.sensing.kinship import lasting_share
 from torchfovea.sensing.retina import Retina
 from torchfovea.setting import require
 from torchfovea.stereo.confidence import read_clues
@@ -167,10 +168,15 @@ def correspondences(
     inlier = valid.to(left_px) if clues is None else valid * inlier_share(budget, clues)
     if retina is None:  # the RFs are the source's pixels
         square = torch.full_like(left_px[:, 0], budget.sigma_over_width**2 + budget.match_px**2)
-        sigma = (square if clues is None else square + doubt(budget, clues)).sqrt()
-        return Correspondences(left_px, right_px, sigma, sigma, valid, inlier)
-    left_sigma, right_sigma = (eye_sigma_px(budget, retina, px, clues) for px in (left_px, right_px))
-    return Correspondences(left_px, right_px, left_sigma, right_sigma, valid, inlier)
+        left_sigma = right_sigma = (square if clues is None else square + doubt(budget, clues)).sqrt()
+        support, source = torch.full_like(left_sigma, 0.5), 1.0
+    else:
+        left_sigma, right_sigma = (eye_sigma_px(budget, retina, px, clues) for px in (left_px, right_px))
+        support, source = retina.width_px(left_px) / 2, 2 * retina.radius_px / (budget.source_px or math.inf)
+    lasting = None
+    if clues is not None and source > 0:
+        lasting = lasting_share(budget, clues, (left_sigma.square() + right_sigma.square()) / source**2)
+    return Correspondences(left_px, right_px, left_sigma, right_sigma, valid, inlier, support, lasting)
 
 
 def checked_range(nearest_range_m: float, farthest_range_m: float) -> tuple[float, float]:

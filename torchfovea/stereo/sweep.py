@@ -21,6 +21,7 @@ from torch import Tensor
 
 from torchfovea.gaussian import columns
 from torchfovea.sensing.correspondence import Budget, Clues, Correspondences, eye_sigma_px, inlier_share
+from torchfovea.sensing.kinship import lasting_share
 from torchfovea.sensing.layout import Retina
 from torchfovea.setting import require
 from torchfovea.stereo.confidence import field_clues
@@ -143,13 +144,18 @@ def match_sweep(
     clues = clues._replace(
         noise_px=noise_px, mismatch=torch.where(valid, 1 - correlation.detach(), zero), hidden_px=hidden_px
     )
+    left_sigma = eye_sigma_px(budget, retina, left_px, clues).expand(batch, -1)
+    right_sigma = (eye_sigma_px(budget, retina, right_px, clues).square() + budget.claim**2 * match_px).sqrt()
+    both = (left_sigma.square() + right_sigma.square()) * eye.scale**2
     matches = Correspondences(
         left_px.expand(batch, -1, -1),
         right_px,
-        eye_sigma_px(budget, retina, left_px, clues).expand(batch, -1),
-        (eye_sigma_px(budget, retina, right_px, clues).square() + budget.claim**2 * match_px).sqrt(),
+        left_sigma,
+        right_sigma,
         valid,
         valid * inlier_share(budget, clues),
+        (retina.width_px(left_px) / 2).expand(batch, -1),
+        None if budget.source_px is None else lasting_share(budget, clues, both),
     )
     inverse_range, sigma, correlation = (
         torch.where(valid, x, zero) for x in (rho / length, sigma / length, correlation)

@@ -1,0 +1,36 @@
+"""Memories that a run goes on from, and those that it leaves: the settings memory.load and memory.save."""
+
+from __future__ import annotations
+
+from omegaconf import DictConfig, OmegaConf
+
+from torchfovea.memory.egosphere import Memory
+from torchfovea.memory.store import check_memory_path, load_memory
+from torchfovea.perception import Observer, check_owner
+from torchfovea.setting import require
+
+__all__ = ["loaded_memory", "memory_path"]
+
+
+def memory_path(cfg: DictConfig, setting: str) -> str | None:
+    """A file's name or None; of memory.save one that can be written."""
+    path = OmegaConf.select(cfg, setting)
+    require(path is None or isinstance(path, str), setting, path, "a file's name, FILE.npz, or null")
+    if path is not None and setting == "memory.save":
+        check_memory_path(path, setting)
+    return None if path is None else str(path)
+
+
+def loaded_memory(cfg: DictConfig, observer: Observer) -> Memory | None:
+    """The memory of the setting memory.load; None: there is none, and episodes begin with an empty one.
+
+    Raises:
+        SettingError: for no memory, a batch of them, and one of another chart or prior than the observer's.
+    """
+    path = memory_path(cfg, "memory.load")
+    if path is None:
+        return None
+    memory = load_memory(path, "memory.load")
+    require(memory.cells.dim() == 2, "memory.load", path, f"one memory, and no batch of {len(memory.cells)}")
+    check_owner(observer, memory)
+    return memory
