@@ -1,5 +1,6 @@
 """Which surface a cell believes in, and what its looks have in common: against loops and Monte Carlo."""
 
+import dataclasses
 import math
 from itertools import pairwise
 
@@ -210,7 +211,7 @@ def test_kinship_counts_fields_by_the_patches_they_cover():
     assert half.lasting is told.lasting
 
 
-def test_what_edges_add_to_a_variance_lasts():
+def test_what_edges_and_doubts_make_of_a_variance_lasts():
     budget = Budget(bend=0.5, gap=0.2, fringe=0.1, noise=0.7, shared=0.6, lasting=0.3)
     one = torch.ones(1)
     clues = Clues(2 * one, one, 3 * one, 4 * one)
@@ -219,6 +220,8 @@ def test_what_edges_add_to_a_variance_lasts():
     assert share.item() == pytest.approx(0.3 + 0.7 * edges / 4)
     assert lasting_share(budget, Clues(0 * one, 0 * one), one).item() == pytest.approx(0.3)
     assert lasting_share(budget, clues, torch.tensor([edges])).item() == pytest.approx(1.0)
+    doubtful = dataclasses.replace(budget, outliers=0.2)
+    assert lasting_share(doubtful, Clues(0 * one, 0 * one), one).item() == pytest.approx(0.3 + 0.7 * 0.2)
 
 
 def test_gradients_reach_inlier_probabilities():

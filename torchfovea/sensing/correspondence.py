@@ -159,7 +159,7 @@ class Budget:
         shared_px: see `shared` [source px].
         shared_widths: see `shared` [widths of the receptive field].
         lasting: share of the variance that another look at the same patch of surface has in common with this one; 0:
-            independent, as in the paper. Never more than `shared`. What bends, holes and rims make of it lasts wholly.
+            independent, as in the paper. Never more than `shared`. What edges and doubts make of it lasts wholly.
     """
 
     sigma_over_width: float = 1 / 6

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchfovea.sensing.correspondence import Budget, Clues, Correspondences, edge_doubt
+from torchfovea.sensing.correspondence import Budget, Clues, Correspondences, edge_doubt, inlier_share
 from torchfovea.sensing.retina import Retina
 
 __all__ = ["Kinship", "kinship", "lasting_share", "once_a_pixel"]
@@ -59,11 +59,11 @@ def lasting_share(budget: Budget, clues: Clues, variance_px2: Tensor) -> Tensor:
         variance_px2: of the disparity, both eyes' together (...) [source px²].
 
     Returns:
-        (...). What the clues of edges add lasts wholly, for the edges stay; of the rest, `Budget.lasting`.
-        Differentiable.
+        (...). What the clues of edges add lasts wholly, for the edges stay, and so does what makes a correspondence
+        doubtful; of the rest, `Budget.lasting`. Differentiable.
     """
-    share = (2 * edge_doubt(budget, clues) / variance_px2.clamp(min=1e-12)).clamp(max=1)
-    return budget.lasting + (1 - budget.lasting) * share
+    smooth = 1 - (2 * edge_doubt(budget, clues) / variance_px2.clamp(min=1e-12)).clamp(max=1)
+    return 1 - (1 - budget.lasting) * smooth * inlier_share(budget, clues)
 
 
 def once_a_pixel(px: Tensor, pixel_px: float, valid: Tensor) -> Tensor:

@@ -93,7 +93,8 @@ def shared_share(looks: Sequence[Judged], budget: Budget) -> tuple[float, float]
 def lasting_share(scenes: Sequence[Sequence[Sight]], budget: Budget) -> float | None:
     """The share of the variance that looks at one patch of surface have in common (`Budget.lasting`).
 
-    Over pairs of looks 5 to 40 degrees apart, the correlation of z of the fields that see one point.
+    Over pairs of looks 5 to 40 degrees apart, the correlation of z of the fields that see one point of a smooth
+    surface: what edges do lasts wholly (`torchfovea.sensing.kinship.lasting_share`).
 
     Args:
         scenes: the looks at each scene.
@@ -114,7 +115,7 @@ def lasting_share(scenes: Sequence[Sequence[Sight]], budget: Budget) -> float | 
                 away, nearest = torch.cdist(one.point_m, other.point_m).min(1)
                 # within half a field, as far as it lies
                 field = one.data.left_width_px * _pixel_m(one.data)
-                same = away < field / 2
+                same = (away < field / 2) & (one.data.region == 0)
                 weight = one.data.area()[same].double()
                 a, b = z[i][same], z[j][nearest[same]]
                 product += float((weight * a * b).sum())
