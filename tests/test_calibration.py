@@ -34,6 +34,7 @@ from torchfovea.studies.calibration import (
     judge,
     judged,
     mixture_nll,
+    mixture_std,
     reliability,
     select,
     sigma_of,
@@ -446,3 +447,15 @@ def test_the_budgets_that_come_along(name):
     budget = construct(Budget, {**cfg.budget, "source_px": 400 if cfg.budget.source else None}, "budget")
     expected = {"ours": Budget(), "printed": Budget.printed}.get(name, budget)
     assert budget == expected and (budget.bend > 0) == (name == "calibrated")
+
+
+def test_one_standard_deviation_for_a_mixture_holds_its_95_percent():
+    p = torch.tensor([1.0, 0.99, 0.9, 0.5, 0.0], dtype=torch.float64)
+    sigma, spread = torch.full_like(p, 0.02), torch.tensor(0.3, dtype=torch.float64)
+    claimed = mixture_std(sigma, p, spread)
+    assert claimed[0].item() == pytest.approx(0.02) and claimed[-1].item() == pytest.approx(math.hypot(0.02, 0.3))
+    rng = np.random.default_rng(0)
+    for share, std in zip(p.tolist(), claimed.tolist(), strict=True):
+        width = np.where(rng.random(400_000) < share, 0.02, math.hypot(0.02, 0.3))
+        inside = np.mean(np.abs(width * rng.normal(size=400_000)) < 1.959964 * std)
+        assert inside == pytest.approx(0.95, abs=0.002)

@@ -20,7 +20,7 @@ from torchfovea.experiments.pairs import gaze_of, load_pair
 from torchfovea.experiments.sense_report import beside, figures_of, read_at_fields
 from torchfovea.experiments.unread import refuse_unread
 from torchfovea.files import replacing, write_result
-from torchfovea.gaussian import Gaussian
+from torchfovea.gaussian import Gaussian, columns
 from torchfovea.sensing.chart import cartesian_from_inverse_range
 from torchfovea.sensing.correspondence import Budget, Correspondences
 from torchfovea.sensing.head import Eyes
@@ -33,6 +33,7 @@ from torchfovea.stereo.matchers import Match, Matcher, checked_matches
 from torchfovea.stereo.matching import match_sgbm
 from torchfovea.stereo.sgbm import SGBM
 from torchfovea.stereo.views import Views
+from torchfovea.studies.calibration import mixture_std
 
 __all__ = ["Sensed", "run", "sense"]
 
@@ -110,7 +111,7 @@ def sense(
     rig = Eyes(eye, torch.zeros(3), eye, torch.tensor([views.rig.baseline_m, 0.0, 0.0]))
     px, (camera, right_camera) = matches.left_px, views.cameras(retina)
     support = torch.full_like(px[..., 0], 0.5) if retina is None else retina.width_px(px) / 2
-    observed = observe(matches, rig, camera, support, points, "inverse_range", rotated, right_camera)
+    observed = _doubted(observe(matches, rig, camera, support, points, "inverse_range", rotated, right_camera))
     moments = cartesian_from_inverse_range(Gaussian(observed.mean, observed.cov), observed.direction)
     if retina is None:
         colour, chosen = views.left.flatten(1).T, observed.valid
@@ -118,6 +119,18 @@ def sense(
         colour = views.fovea(views.left[None], retina)[0].T
         chosen = once_a_pixel(px, 1 / views.scale(retina), observed.valid)
     return Sensed(matches, observed, moments, colour, chosen)
+
+
+def _doubted(observed: Observations) -> Observations:
+    """Observations whose inverse ranges are as uncertain as they are, a doubtful match taken in (`mixture_std`)."""
+    rho, valid = observed.mean[:, 2], observed.valid
+    if observed.inlier is None or int(valid.sum()) < 2:
+        return observed
+    *rest, variance = observed.cov.unbind(-1)
+    sigma = variance.sqrt()
+    factor = torch.where(valid, mixture_std(sigma, observed.inlier, rho[valid].std()) / sigma, 1.0)
+    aa, ab, ar, bb, br = rest
+    return observed._replace(cov=columns(aa, ab, factor * ar, bb, factor * br, factor.square() * variance))
 
 
 def _write(folder: Path, sensed: Sensed) -> None:

@@ -31,8 +31,8 @@ from torchfovea.sensing.unscented import SigmaPoints
 from torchfovea.setting import require
 
 __all__ = [
-    "LEVELS", "Judged", "concatenate", "inlier_of", "judge", "judged", "mixture_nll", "reliability", "select",
-    "sigma_of",
+    "LEVELS", "Judged", "concatenate", "inlier_of", "judge", "judged", "mixture_nll", "mixture_std", "reliability",
+    "select", "sigma_of",
 ]  # fmt: skip
 
 LEVELS = (0.5, 0.9, 0.95, 0.99)
@@ -297,3 +297,27 @@ def _median(values: Tensor, weight: Tensor) -> float:
     order = values.argsort()
     total = weight[order].cumsum(0)
     return float(values[order][int((total < total[-1] / 2).sum())])
+
+
+def mixture_std(sigma: Tensor, inlier: Tensor, spread: Tensor) -> Tensor:
+    """Standard deviation of the Gaussian that has a mixture's 95% interval: one number for who asks for one.
+
+    Of p N(0, σ²) + (1 − p) N(0, σ² + S²): with probability 1 − p the error is another surface's distance.
+
+    Args:
+        sigma: of inliers, (N,).
+        inlier: p, (N,).
+        spread: S, how far surfaces lie apart, broadcastable to (N,).
+
+    Returns:
+        (N,), from σ where p = 1 to √(σ² + S²) where p = 0. Not differentiable.
+    """
+    wide, root = (sigma.square() + spread.square()).sqrt(), math.sqrt(2)
+    end = root * float(torch.erfinv(torch.tensor(0.95, dtype=torch.float64)))
+    low, high = sigma.detach().double(), wide.detach().double()
+    for _ in range(50):
+        middle = (low + high) / 2
+        within, beyond = (torch.erf(end * middle / (root * width)) for width in (sigma, wide))
+        inside = inlier * within + (1 - inlier) * beyond
+        low, high = torch.where(inside < 0.95, middle, low), torch.where(inside < 0.95, high, middle)
+    return ((low + high) / 2).to(sigma)
