@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchfovea.gaussian import columns
-from torchfovea.memory.egosphere import Fusion, Prior, belief, empty_memory, trust
+from torchfovea.memory.egosphere import Fusion, Prior, belief, empty_memory, reducible, trust
 from torchfovea.memory.pooling import pool_patches, share_errors
 from torchfovea.memory.update import fuse, remember
 from torchfovea.memory.voting import Sight, against, cast
@@ -233,3 +233,23 @@ def test_gradients_reach_inlier_probabilities():
         return trust(memory), belief(memory).cov[..., 5]
 
     assert torch.autograd.gradcheck(figures, (inlier,))
+
+
+def test_what_lasts_is_not_worth_another_look():
+    seen = look(0.4, fields=25)
+    patch = torch.full((25,), 0.04, dtype=torch.float64)
+    assert reducible(after(*[seen] * 3)).item() == 1
+    for share in (0.0, 0.3, 0.9):
+        kin = Kinship(patch, 0.9, torch.full_like(patch, share))
+        shares = [reducible(after(*[seen] * k, kin=kin)).item() for k in (1, 2, 8, 64)]
+        assert all(0 <= s <= 1 for s in shares)
+        if share:
+            assert all(later < sooner for sooner, later in pairwise(shares))
+        else:
+            assert shares == [1.0] * 4
+    # of one look, what another would not repeat
+    kin, variance = Kinship(patch, 0.9, torch.full_like(patch, 0.3)), 0.01**2
+    first = after(seen, kin=kin)
+    assert reducible(first).item() * belief(first).cov[0, 5].item() == pytest.approx(
+        belief(first).cov[0, 5].item() - 0.3 * variance / 2, rel=1e-3
+    )

@@ -30,6 +30,7 @@ from torchfovea.memory.egosphere import (
     cartesian_from_patches,
     check_chart,
     empty_memory,
+    reducible,
     trust,
 )
 from torchfovea.memory.encoders import encoder_covariance
@@ -222,21 +223,25 @@ def _rewards(observer: Observer, memory: Memory) -> tuple[Gaussian, RewardBelief
     return points, reward, then
 
 
-def reward_of(observer: Observer, memory: Memory) -> tuple[Gaussian, RewardBelief]:
-    """Each cell's 3-D belief and reward (Eq. 36-40).
+def reward_of(observer: Observer, memory: Memory) -> tuple[Gaussian, RewardBelief, Tensor]:
+    """Each cell's 3-D belief, its reward (Eq. 36-40), and the standard deviation that is worth exploring (..., Nx).
 
     A surface is worth its reward as far as it is believed, for the rest what an unseen cell is: mean and standard
     deviation are averaged with the prior's by `torchfovea.memory.egosphere.trust`, so that no doubtful surface wins a
     comparison of thousands. Of the prior's standard deviation looks that should have shown something, and did not,
-    leave less and less. Unseen cells that no look has reached share the prior's reward exactly: ties are ties.
+    leave less and less. Unseen cells that no look has reached share the prior's reward exactly: ties are ties. What no
+    look can change is not worth exploring, see `torchfovea.memory.egosphere.reducible`.
     """
     points, reward, unseen = _rewards(observer, memory)
     sure, fruitless = trust(memory), memory.votes[..., 1]
     mean, std = (then.to(reward.mean) for then in unseen)
     std = std * (1 + fruitless).rsqrt()
     mean = torch.where(sure > 0, sure * reward.mean + (1 - sure) * mean, mean)
-    std = torch.where(sure > 0, sure * reward.std + (1 - sure) * std, std)
-    return points, RewardBelief(mean, std)
+    whole, open_to_looks = (
+        torch.where(sure > 0, sure * known + (1 - sure) * std, std)
+        for known in (reward.std, reward.std * reducible(memory).sqrt())
+    )
+    return points, RewardBelief(mean, whole), open_to_looks
 
 
 def _unseen_points(memory: Memory) -> Tensor:
@@ -265,7 +270,7 @@ def decide(
         SettingError: for a memory of another chart or prior than the observer's.
     """
     check_owner(observer, memory)
-    points, reward = reward_of(observer, memory)
+    points, reward, open_to_looks = reward_of(observer, memory)
     seen = memory.looks > 0
     # the eyes meet where the surface is, or where an unseen one would be while it is more likely not there
     doubted = seen & (trust(memory) < 0.5)
@@ -280,7 +285,7 @@ def decide(
     zero = torch.zeros_like(incumbent)
     view = View(
         reward.mean,
-        reward.std,
+        open_to_looks,
         incumbent,
         eligible,
         memory.cells,

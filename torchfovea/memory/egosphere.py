@@ -34,6 +34,7 @@ __all__ = [
     "empty_memory",
     "forget",
     "prior_information",
+    "reducible",
     "trust",
 ]
 
@@ -235,6 +236,17 @@ def belief(memory: Memory) -> Gaussian:
     once, twice = memory.lasting.unbind(-1)
     *rest, variance = cov.unbind(-1)
     return Gaussian(mean, columns(*rest, variance + variance.square() * (once.square() - twice).clamp(min=0)))
+
+
+def reducible(memory: Memory) -> Tensor:
+    """The share of the variance of `belief`'s inverse range that further looks may take away, (..., Nx).
+
+    What lasts between looks is not worth another one. Differentiable.
+    """
+    variance = gaussian_from_information(memory.information).cov[..., 5]
+    once, twice = memory.lasting.unbind(-1)
+    lasts = variance * (once.square() - twice).clamp(min=0)
+    return ((1 - variance * twice).clamp(min=0) / (1 + lasts)).clamp(max=1)
 
 
 def trust(memory: Memory) -> Tensor:
