@@ -259,5 +259,5 @@ def _source(view: View) -> Generators:
     return view.generator
 
 
-DEFAULT: Strategy = partial(upper_confidence_bound, alpha=1.0)
-"""The upper confidence bound with α = 1."""
+DEFAULT: Strategy = partial(upper_confidence_bound, alpha=2.0)
+"""The upper confidence bound with α = 2."""
