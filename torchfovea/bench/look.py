@@ -27,12 +27,14 @@ class Saccade(NamedTuple):
         memory: an empty one.
         matches: of a look (N,).
         pose: of the eyes.
+        alpha: of the upper confidence bound that decides.
     """
 
     observer: Observer
     memory: Memory
     matches: Correspondences
     pose: Eyes
+    alpha: float = 1.0
 
 
 def moved_to(value: Any, device: str) -> Any:

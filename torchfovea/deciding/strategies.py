@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -257,7 +256,3 @@ def _source(view: View) -> Generators:
     require(view.generator is not None, "generator", None, "a torch.Generator, for this strategy draws lots")
     assert view.generator is not None
     return view.generator
-
-
-DEFAULT: Strategy = partial(upper_confidence_bound, alpha=1.0)
-"""The upper confidence bound with α = 1."""

@@ -8,8 +8,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchfovea.arena import Fixation, Look, Move
+from torchfovea.arena import Fixation
 from torchfovea.perception import Observer
+from torchfovea.search import Look, Move
 from torchfovea.sensing.fields import draw_fields, for_all
 from torchfovea.sensing.geometric import correspond_points
 from torchfovea.sensing.head import Gaze, clamp_gaze, cyclopean, eyes, to_ego
@@ -23,7 +24,7 @@ __all__ = ["GeometricArenas"]
 
 
 class GeometricArenas:
-    """B scenes seen by observers of one kind: what `torchfovea.sim.arena.Arena` does for one.
+    """B scenes seen by observers of one kind: what `torchfovea.sim.arena.SimulatedArena` does for one.
 
     Args:
         scenes: B, built for the observer's head; one may appear several times.
@@ -31,7 +32,7 @@ class GeometricArenas:
         sample: how many receptive fields a look goes through, drawn anew each time; None: all of them.
         device: where rays are traced, in float64.
         motor: its model of durations.
-        seeds: of each row's encoder noise, see `torchfovea.sim.arena.Arena`; by default 0, 1, ...
+        seeds: of each row's encoder noise, see `torchfovea.sim.arena.SimulatedArena`; by default 0, 1, ...
     """
 
     def __init__(
