@@ -9,7 +9,9 @@ import torchfovea as tf
 from torchfovea.search import Look, Move, search
 from torchfovea.sim.scene import Cans, build_scene
 from torchfovea.sim.world import World
-from torchfovea.stereo.matching import match_sgbm, verged
+from torchfovea.stereo.matching import match_sgbm
+from torchfovea.stereo.rig import verged
+from torchfovea.stereo.views import verged_views
 
 
 class Robot:
@@ -24,9 +26,8 @@ class Robot:
 
     def look(self, gaze: tf.Gaze, generator: object) -> Look:  # grab both images and match them
         left, right = (frame.image for frame in self.world.images())
-        rig = verged(gaze.vergence, self.observer.head.baseline_m)
-        matches, found = match_sgbm(left, right, rig, self.observer.camera, self.observer.retina)
-        return Look(matches, found)
+        rig, retina = verged(gaze.vergence, self.observer.head.baseline_m), self.observer.retina
+        return Look(*match_sgbm(verged_views(left, right, rig, self.observer.camera, retina.radius_px), retina))
 
 
 observer = tf.Observer(camera=tf.Pinhole.from_fov(90, 100))
