@@ -15,7 +15,7 @@ from torchfovea.perception import Eligibility, Observer, decide, new_memory, per
 from torchfovea.search import Look, Move, search
 from torchfovea.sensing.camera import Pinhole
 from torchfovea.sensing.correspondence import Budget, Correspondences
-from torchfovea.sensing.geometric import correspond_points
+from torchfovea.sensing.geometric import correspond_points, with_noise
 from torchfovea.sensing.head import Gaze, Head, clamp_gaze, cyclopean, eyes, fixate, to_ego
 from torchfovea.sensing.layout import LogPolar, Uniform
 from torchfovea.sensing.unscented import SigmaPoints
@@ -55,7 +55,8 @@ class Spheres:
         points, _ = meet(pose.t_left.double(), to_ego(pose.R_left, o.camera.rays(px)).double())
         again, _ = meet(pose.t_right.double(), points - pose.t_right.double())
         visible = (again - points).norm(dim=-1) < 1e-6
-        return Look(correspond_points(points.to(dtype), visible, px, pose, o.camera, o.retina, o.budget, generator))
+        matches = correspond_points(points.to(dtype), visible, px, pose, o.camera, o.retina, o.budget)
+        return Look(with_noise(matches, o.retina, generator))
 
     def fixation(self, gaze: Gaze) -> Fixation:
         rotation, origin = cyclopean(HEAD, Gaze(*(a.double() for a in gaze)))

@@ -158,7 +158,7 @@ def perceive(
         memory: before.
         matches: the saccade's correspondences (..., N).
         eyes: where the eyes were.
-        common: what the receptive fields' errors share, see `torchfovea.memory.egosphere.remember`; by default what the
+        common: what the receptive fields' errors share, see `torchfovea.memory.update.remember`; by default what the
             head's encoders get wrong.
 
     Differentiable in the correspondences. Leaving out those that are not valid changes nothing: what each stands for

@@ -13,7 +13,7 @@ from torchfovea.memory.egosphere import Memory
 from torchfovea.perception import Observer, new_memory
 from torchfovea.sensing.correspondence import Correspondences
 from torchfovea.sensing.fields import for_all
-from torchfovea.sensing.geometric import correspond_points
+from torchfovea.sensing.geometric import correspond_points, with_noise
 from torchfovea.sensing.head import Eyes, eyes, fixate, to_ego
 
 __all__ = ["Saccade", "batch_of", "flat_of", "moved_to", "part_of", "saccade", "shares", "support_of"]
@@ -54,7 +54,8 @@ def saccade(observer: Observer, cells: Tensor, device: str = "cpu", seed: int = 
     points = pose.t_left + distance * ray
     seen = torch.ones(len(left), dtype=torch.bool)
     generator = torch.Generator().manual_seed(seed)
-    matches = correspond_points(points, seen, left, pose, observer.camera, observer.retina, observer.budget, generator)
+    matches = correspond_points(points, seen, left, pose, observer.camera, observer.retina, observer.budget)
+    matches = with_noise(matches, observer.retina, generator)
     return moved_to(Saccade(observer, new_memory(observer, cells), matches, pose), device)
 
 

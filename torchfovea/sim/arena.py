@@ -13,7 +13,7 @@ from torchfovea.perception import Observer
 from torchfovea.search import Look, Move
 from torchfovea.sensing.correspondence import Disparity
 from torchfovea.sensing.fields import draw_fields, for_all
-from torchfovea.sensing.geometric import correspond_points
+from torchfovea.sensing.geometric import correspond_points, with_noise
 from torchfovea.sensing.head import Gaze, eyes
 from torchfovea.sim.truth import truth_of
 from torchfovea.sim.world import World
@@ -100,8 +100,9 @@ class SimulatedArena:
         visible = seen.hit & seen.visible_right
         pose = eyes(observer.head, gaze)
         matches = correspond_points(
-            seen.points_e, visible, left_px, pose, observer.camera, observer.retina, observer.budget, generator
+            seen.points_e, visible, left_px, pose, observer.camera, observer.retina, observer.budget
         )
+        matches = with_noise(matches, observer.retina, generator)
         return Look(matches if chosen is None else for_all(matches, observer.retina))
 
     def truth(self, cells: Tensor) -> Truth:

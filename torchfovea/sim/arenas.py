@@ -12,7 +12,7 @@ from torchfovea.arena import Fixation
 from torchfovea.perception import Observer
 from torchfovea.search import Look, Move
 from torchfovea.sensing.fields import draw_fields, for_all
-from torchfovea.sensing.geometric import correspond_points
+from torchfovea.sensing.geometric import correspond_points, with_noise
 from torchfovea.sensing.head import Gaze, clamp_gaze, cyclopean, eyes, to_ego
 from torchfovea.setting import require
 from torchfovea.sim.model import Scene
@@ -99,9 +99,8 @@ class GeometricArenas:
         if some:
             left_px = left_px[torch.stack([index for index in chosen if index is not None]).to(device)]
         points, visible = self._surfaces(gaze, observer.camera.rays(left_px))
-        matches = correspond_points(
-            points, visible, left_px, pose, observer.camera, observer.retina, observer.budget, generators
-        )
+        matches = correspond_points(points, visible, left_px, pose, observer.camera, observer.retina, observer.budget)
+        matches = with_noise(matches, observer.retina, generators)
         return Look(for_all(matches, observer.retina) if some else matches)
 
     def _surfaces(self, gaze: Gaze, left_rays: Tensor) -> tuple[Tensor, Tensor]:
