@@ -81,6 +81,6 @@ def checked_matches(answer: object, retina: Retina) -> tuple[Correspondences, An
     for name, part in matches._asdict().items():
         shape = (retina.count, 2)[: 2 if name in ("left_px", "right_px") else 1]
         fits = isinstance(part, Tensor) and tuple(part.shape) == shape
-        fits = fits or (part is None and name in ("inlier", "support_px"))
+        fits = fits or (part is None and name in matches._field_defaults)
         require(fits, f"matcher's {name}", getattr(part, "shape", part), f"{shape}, one for each receptive field")
     return matches, answer[1]
