@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchfovea.arena import stack
 from torchfovea.gaussian import columns
 from torchfovea.memory.egosphere import Memory
 from torchfovea.perception import Observer, new_memory
@@ -88,8 +89,7 @@ def batch_of(looks: Sequence[Saccade]) -> Saccade:
     first = looks[0]
     cells = torch.stack([look.memory.cells.cpu() for look in looks])
     device = str(first.memory.cells.device)
-    matches = [torch.stack(parts) for parts in zip(*(look.matches for look in looks), strict=True)]
-    matches = [columns(*part.unbind(-1)) if part.dim() == 3 else part for part in matches]
-    pose = Eyes(*(torch.stack(parts) for parts in zip(*(look.pose for look in looks), strict=True)))
+    matches, pose = (stack([getattr(look, part) for look in looks]) for part in ("matches", "pose"))
+    places = {part: columns(*getattr(matches, part).unbind(-1)) for part in ("left_px", "right_px")}
     memory = moved_to(new_memory(first.observer, columns(*cells.unbind(-1))), device)
-    return Saccade(first.observer, memory, Correspondences(*matches), pose)
+    return Saccade(first.observer, memory, matches._replace(**places), pose)
