@@ -4,7 +4,6 @@ import csv
 import dataclasses
 import json
 import math
-from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,14 +14,12 @@ from torchfovea.bench import paths, retina_paths, steps, timing
 from torchfovea.bench.look import saccade
 from torchfovea.bench.timing import Growth, Path, copy_bandwidth, interleaved, nbytes, same, slope
 from torchfovea.cli import main
-from torchfovea.deciding.strategies import expected_improvement, upper_confidence_bound
 from torchfovea.experiments import bench
 from torchfovea.memory import sphere
 from torchfovea.memory.egosphere import Fusion
 from torchfovea.perception import Observer
 from torchfovea.sensing.head import fixate
 from torchfovea.sensing.layout import LogPolar
-from torchfovea.setting import SettingError
 
 FULL = Observer(retina=LogPolar(1500))
 PLAIN = dataclasses.replace(FULL, fusion=Fusion(fill=False, conflict=math.inf))
@@ -61,15 +58,8 @@ def test_ours_and_every_peer_compute_the_same(look):
 
 @pytest.mark.parametrize("alpha", [0.0, 2.0, 1000.0])
 def test_the_peers_decide_by_the_observers_alpha(look, alpha):
-    bold = dataclasses.replace(PLAIN, acquisition=partial(upper_confidence_bound, alpha=alpha))
-    for path in steps.paths_of_steps(look._replace(observer=bold), FULL):
+    for path in steps.paths_of_steps(look._replace(alpha=alpha), FULL):
         path.check()
-
-
-def test_peers_know_the_upper_confidence_bound_only(look):
-    other = dataclasses.replace(PLAIN, acquisition=expected_improvement)
-    with pytest.raises(SettingError, match="expected ucb, in bench"):
-        steps.paths_of_steps(look._replace(observer=other), FULL)[0].check()
 
 
 def _wrong(result):

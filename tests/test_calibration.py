@@ -196,7 +196,7 @@ def test_first_order_is_what_observe_says(camera, generator):
     away = 0.6 + 0.8 * torch.rand(RETINA.count, generator=generator, dtype=torch.float64)
     points = pose.t_left + to_ego(pose.R_left, ray) * away[:, None]
     visible = torch.ones(RETINA.count, dtype=torch.bool)
-    matches = correspond_points(points, visible, left_px, pose, camera, RETINA, budget, None)
+    matches = correspond_points(points, visible, left_px, pose, camera, RETINA, budget)
     clues = Clues(*(torch.rand(RETINA.count, generator=generator, dtype=torch.float64) for _ in range(2)))
     matches = matches._replace(
         left_sigma_px=eye_sigma_px(budget, RETINA, matches.left_px, clues),
@@ -346,7 +346,7 @@ def test_matches_carry_the_same_sigma_as_the_fit_assumes():
 
     pose = Eyes(same, torch.zeros(3), same, torch.tensor([0.1, 0.0, 0.0]))
     data, which = judged(found, pose, left, retina, own, torch.ones(retina.count), clues, right)
-    seen = observe(found, pose, left, width, right_camera=right)
+    seen = observe(found, pose, (left, right), width)
     assert data.bend_px.max() > 2 and data.gap_px.max() > 0 and data.claim_px.max() == 0
     ratio = sigma_of(data, own).double() / seen.cov[which, 5].sqrt().double()
     assert ratio.median().item() == pytest.approx(1, abs=2e-3) and (ratio - 1).abs().quantile(0.9) < 0.05

@@ -6,15 +6,16 @@ from functools import partial
 import pytest
 import torch
 
-from torchfovea.arena import Fixation, Look, Move, Together, Truth, stack
+from torchfovea.arena import Arenas, Fixation, Truth, stack
 from torchfovea.deciding.strategies import expected_improvement, probability_of_improvement, upper_confidence_bound
-from torchfovea.episode import run_episode, run_episodes
+from torchfovea.episode import Rules, run_episode, run_episodes
 from torchfovea.memory.egosphere import Fusion, Prior
 from torchfovea.memory.sphere import fibonacci_directions
 from torchfovea.perception import Eligibility, Observer, decide, new_memory, perceive
+from torchfovea.search import Look, Move, search
 from torchfovea.sensing.camera import Pinhole
 from torchfovea.sensing.correspondence import Budget, Correspondences
-from torchfovea.sensing.geometric import correspond_points
+from torchfovea.sensing.geometric import correspond_points, with_noise
 from torchfovea.sensing.head import Gaze, Head, clamp_gaze, cyclopean, eyes, fixate, to_ego
 from torchfovea.sensing.layout import LogPolar, Uniform
 from torchfovea.sensing.unscented import SigmaPoints
@@ -54,7 +55,8 @@ class Spheres:
         points, _ = meet(pose.t_left.double(), to_ego(pose.R_left, o.camera.rays(px)).double())
         again, _ = meet(pose.t_right.double(), points - pose.t_right.double())
         visible = (again - points).norm(dim=-1) < 1e-6
-        return Look(correspond_points(points.to(dtype), visible, px, pose, o.camera, o.retina, o.budget, generator))
+        matches = correspond_points(points.to(dtype), visible, px, pose, o.camera, o.retina, o.budget)
+        return Look(with_noise(matches, o.retina, generator))
 
     def fixation(self, gaze: Gaze) -> Fixation:
         rotation, origin = cyclopean(HEAD, Gaze(*(a.double() for a in gaze)))
@@ -77,10 +79,10 @@ def cells_in_reach(count: int, dtype=torch.float64) -> torch.Tensor:
     return directions[fixate(HEAD, directions)[1]]
 
 
-def run(observer: Observer, seed: int = 0, saccades: int = 8, dtype=torch.float64, cells: int = 4000):
+def run(observer: Observer, seed: int = 0, saccades: int = 8, dtype=torch.float64, cells: int = 4000, **rules):
     arena, memory = Spheres(observer), new_memory(observer, cells_in_reach(cells, dtype))
     generator = torch.Generator().manual_seed(seed)
-    return run_episode(observer, memory, arena, arena.truth(memory.cells), saccades, generator)
+    return run_episode(observer, memory, arena, arena.truth(memory.cells), generator, Rules(saccades, **rules))
 
 
 @pytest.mark.parametrize("retina", [LogPolar(1500), Uniform(1500)], ids=["log_polar", "uniform"])
@@ -88,7 +90,7 @@ def run(observer: Observer, seed: int = 0, saccades: int = 8, dtype=torch.float6
     "acquisition", [partial(upper_confidence_bound, alpha=1.0), probability_of_improvement, expected_improvement]
 )
 def test_finds_the_ball(retina, acquisition):
-    episode = run(small(retina=retina, acquisition=acquisition))
+    episode = run(small(retina=retina), strategy=acquisition)
     assert bool(episode.hit.any()) and episode.moves <= 7
     assert episode.gap[-1] > 0.9 and episode.target_error_m < 0.05
     assert bool((episode.gap.diff() >= 0).all()) and bool((episode.global_information.diff() > 0).all())
@@ -179,27 +181,34 @@ def test_errors_name_the_setting(call, message):
 
 
 def test_alpha_infinity_is_pure_exploration():
-    episode = run(small(acquisition=partial(upper_confidence_bound, alpha=math.inf)), saccades=4)
-    greedy = run(small(acquisition=partial(upper_confidence_bound, alpha=0.0)), saccades=4)
+    episode = run(small(), saccades=4, strategy=partial(upper_confidence_bound, alpha=math.inf))
+    greedy = run(small(), saccades=4, strategy=partial(upper_confidence_bound, alpha=0.0))
     assert episode.global_information[-1] > greedy.global_information[-1]
 
 
 def test_a_batch_is_its_episodes_one_by_one():
-    observer = small(retina=LogPolar(800), acquisition=partial(upper_confidence_bound, alpha=2.0))
+    observer = small(retina=LogPolar(800))
     memories = [new_memory(observer, cells_in_reach(n)[:350]) for n in (3000, 3300)]
     arena = Spheres(observer)
     alone = [
-        run_episode(observer, memory, arena, arena.truth(memory.cells), 4, torch.Generator().manual_seed(seed))
+        run_episode(
+            observer,
+            memory,
+            arena,
+            arena.truth(memory.cells),
+            torch.Generator().manual_seed(seed),
+            Rules(4, partial(upper_confidence_bound, alpha=2.0)),
+        )
         for seed, memory in enumerate(memories)
     ]
     settings = torch.tensor([2.0, 2.0], dtype=torch.float64)
     together = run_episodes(
-        small(retina=LogPolar(800), acquisition=partial(upper_confidence_bound, alpha=settings)),
+        observer,
         stack(memories),
-        Together([arena, arena]),
+        Arenas([arena, arena]),
         [arena.truth(memory.cells) for memory in memories],
-        4,
         [torch.Generator().manual_seed(seed) for seed in range(2)],
+        Rules(4, partial(upper_confidence_bound, alpha=settings)),
     )
     for one, of_many in zip(alone, together, strict=True):
         for a, b in zip(one.gaze, of_many.gaze, strict=True):
@@ -213,13 +222,60 @@ def test_the_stop_rule_ends_on_the_best_cell():
     observer = small(retina=LogPolar(800))
     arena, memory = Spheres(observer), new_memory(observer, cells_in_reach(1500))
 
-    def search(stop):
+    def judged(stop):
         generator = torch.Generator().manual_seed(0)
-        return run_episode(observer, memory, arena, arena.truth(memory.cells), 9, generator, stop=stop)
+        return run_episode(observer, memory, arena, arena.truth(memory.cells), generator, Rules(9, stop=stop))
 
-    easy, never = search((10.0, 0.5)), search(None)
+    easy, never = judged((10.0, 0.5)), judged(None)
     assert easy.looks == 1 and never.looks == 9
     # after the last look the best cell is fixated, and then nothing changes
     assert len(easy.gap) == 9 and bool((easy.gaze.pan[1:] == easy.gaze.pan[1]).all())
     assert torch.equal(easy.global_information, easy.global_information[:1].expand(9))
     assert easy.degrees < never.degrees
+
+
+@pytest.mark.parametrize("stop", [None, (0.2, 0.05)])
+def test_a_robot_that_knows_no_truth_searches_as_the_judged_one(stop):
+    observer = small(retina=LogPolar(800))
+    arena, memory = Spheres(observer), new_memory(observer, cells_in_reach(1500))
+    told = run_episode(
+        observer, memory, arena, arena.truth(memory.cells), torch.Generator().manual_seed(0), Rules(6, stop=stop)
+    )
+
+    class Blindfolded:
+        """The same robot, without `fixation` and `truth`."""
+
+        saccade, look = arena.saccade, arena.look
+
+    glances = list(search(Blindfolded(), observer, memory, 6, torch.Generator().manual_seed(0), stop=stop))
+    assert sum(glance.look is not None for glance in glances) == told.looks
+    for t, glance in enumerate(glances):
+        assert glance.step.memory.cells.shape == memory.cells.shape
+        for a, b in zip(glance.move.gaze, told.gaze, strict=True):
+            torch.testing.assert_close(a, b[t])
+        if t + 1 < len(glances):
+            assert all(map(torch.equal, glances[t + 1].move.gaze, clamp_gaze(HEAD, glance.step.gaze)))
+    torch.testing.assert_close(glances[-1].step.points.mean, told.step.points.mean)
+    if stop is not None:
+        assert len(glances) < 6 and glances[-1].look is None and not glances[-1].looked
+
+
+def test_a_robot_is_asked_for_what_it_promised():
+    observer = small(retina=LogPolar(300))
+    memory, arena = new_memory(observer, cells_in_reach(300)), Spheres(observer)
+
+    class Odd:
+        saccade = staticmethod(lambda gaze: gaze)
+        look = arena.look
+
+    class Mute:
+        saccade = arena.saccade
+        look = staticmethod(lambda gaze, generator: None)
+
+    for robot, message in ((Odd(), "robot.saccade = Gaze: expected"), (Mute(), "robot.look = NoneType: expected")):
+        with pytest.raises(SettingError, match=message):
+            next(search(robot, observer, memory, 3))
+    with pytest.raises(SettingError, match="saccades = 0"):
+        search(arena, observer, memory, 0)  # at once, and not at the first glance
+    with pytest.raises(SettingError, match="far_m = nan"):
+        Rules(3, far_m=math.nan)

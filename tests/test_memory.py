@@ -127,7 +127,7 @@ def test_leaving_out_what_is_not_valid_changes_nothing(observer, sample):
     visible = torch.rand(len(px), generator=rng) < 0.6
     pose = eyes(observer.head, Gaze(*torch.tensor([0.1, -0.2, 0.15], dtype=torch.float64)))
     points = pose.t_left + 1.5 * to_ego(pose.R_left, observer.camera.rays(px))
-    matches = correspond_points(points, visible, px, pose, observer.camera, observer.retina, observer.budget, None)
+    matches = correspond_points(points, visible, px, pose, observer.camera, observer.retina, observer.budget)
     matches = matches if chosen is None else for_all(matches, observer.retina)
     masked, dropped = (
         perceive(observer, new_memory(observer, cells), part, pose) for part in (matches, matches.take(matches.valid))

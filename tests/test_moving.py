@@ -14,7 +14,6 @@ from torchfovea.memory.update import fuse
 from torchfovea.sensing.chart import basis
 from torchfovea.setting import SettingError
 
-ONE = torch.Size([])
 PRIOR = Prior()
 BOX = torch.tensor(
     [[0.4, 0, 0], [-0.5, 0, 0], [0, 0.6, 0], [0, -0.5, 0], [0, 0, 0.7], [0, 0, -1.8]], dtype=torch.float64

@@ -1,6 +1,7 @@
 """Strategies on a memory that knows something, and what is drawn when only some receptive fields look."""
 
 import dataclasses
+import inspect
 import math
 from functools import partial
 
@@ -142,11 +143,11 @@ def test_decide_hands_over_what_it_knows():
         seen.append(view)
         return view.mean, len(seen)
 
-    observer = Observer(acquisition=spy)
+    observer = Observer()
     memory = new_memory(observer, fibonacci_directions(60, torch.float64))
     zero = torch.zeros((), dtype=torch.float64)
-    first = decide(observer, memory)
-    second = decide(observer, memory, None, Gaze(zero + 0.3, zero, zero), first)
+    first = decide(observer, memory, strategy=spy)
+    second = decide(observer, memory, None, Gaze(zero + 0.3, zero, zero), first, spy)
     assert seen[0].state is None and seen[0].last == -1 and seen[1].state == 1 and second.state == 2
     assert seen[1].last == first.cell
     assert torch.allclose(seen[0].line_of_sight, torch.tensor([1.0, 0, 0], dtype=torch.float64))
@@ -187,10 +188,11 @@ def test_the_configuration_has_the_defaults_of_the_dataclasses():
     observer = build_observer(cfg)
     plain = Observer()
     for field in dataclasses.fields(Observer):
-        if field.name != "acquisition":
-            assert getattr(observer, field.name) == getattr(plain, field.name), field.name
+        assert getattr(observer, field.name) == getattr(plain, field.name), field.name
     strategy = build_strategy(cfg, observer)
-    assert strategy.func is plain.acquisition.func and strategy.keywords == plain.acquisition.keywords
+    assert strategy.func is strategies.upper_confidence_bound
+    default = inspect.signature(strategies.upper_confidence_bound).parameters["alpha"].default
+    assert strategy.keywords == {"alpha": default}
     for kind, node in (
         (Head, cfg.head), (Budget, cfg.budget), (Fusion, cfg.fusion), (Prior, cfg.prior),
         (Eligibility, cfg.eligibility), (LogPolar, cfg.sensor), (Cans, cfg.scene),
@@ -259,3 +261,10 @@ def test_the_eyes_do_not_meet_at_a_surface_that_is_doubted():
     for votes, range_m in (((2.0, 0.0), 1 / 1.5), ((0.2, 1.8), 1 / observer.prior.mean)):
         step = decide(observer, known_memory(observer, cells, rho, votes))
         assert gaze_point(observer.head, step.gaze).norm().item() == pytest.approx(range_m, rel=1e-3)
+
+
+def test_a_strategy_is_no_part_of_an_observer():
+    expected = r"Observer\(acquisition\) = raster: expected decide\(..., strategy=\) or search"
+    with pytest.raises(SettingError, match=expected):
+        Observer(acquisition=strategies.raster)
+    assert dataclasses.replace(Observer(), reward="range").reward == "range"

@@ -264,11 +264,10 @@ def test_the_bilinear_form_is_the_transform_point_by_point(points, rotated, monk
     spread = 0.2 + torch.rand(2, 400, generator=rng, dtype=torch.float64)
     spread[0, :20], spread[1, 20:40] = 0.0, 300.0
     matches = matches._replace(right_px=seen, left_sigma_px=spread[0], right_sigma_px=spread[1])
-    first, second = Pinhole(CAMERA.focal_px, 1.5, 2.5), other
-    kind = {"points": points, "rotated": rotated, "right_camera": second}
-    quick = observe(matches, pose, first, HALF, **kind)
+    cameras, kind = (Pinhole(CAMERA.focal_px, 1.5, 2.5), other), {"points": points, "rotated": rotated}
+    quick = observe(matches, pose, cameras, HALF, **kind)
     general(monkeypatch)
-    slow = observe(matches, pose, first, HALF, **kind)
+    slow = observe(matches, pose, cameras, HALF, **kind)
     assert 0 < int((~slow.valid).sum()) < 200
     for name, a, b in zip(slow._fields[:6], quick[:6], slow[:6], strict=True):
         torch.testing.assert_close(a, b, rtol=1e-7, atol=1e-10, msg=lambda said, name=name: f"{name}: {said}")

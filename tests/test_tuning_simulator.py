@@ -16,7 +16,7 @@ from torchfovea.setting import SettingError
 from torchfovea.tuning.bias import Shape
 from torchfovea.tuning.problem import Problem
 from torchfovea.tuning.scenes import Distribution, Scenes, cast, draw_scenes, stream
-from torchfovea.tuning.simulator import Memory, Task, best_cell, empty, glance, look, score, simulate, world_of
+from torchfovea.tuning.simulator import Known, Task, best_cell, empty, glance, look, score, simulate, world_of
 
 HEAD = Head()
 
@@ -43,7 +43,7 @@ def test_the_variance_law_is_that_of_observe(fov_deg, uniform):
     seen = to_ego(pose.R_left.mT, point - pose.t_left)
     left = seer.camera.project(seen)
     visible = seer.retina.inside(left) & seer.camera.in_view(seen)
-    matches = correspond_points(point, visible, left, pose, seer.camera, seer.retina, seer.budget, None)
+    matches = correspond_points(point, visible, left, pose, seer.camera, seer.retina, seer.budget)
     expected = observe(matches, pose, seer.camera, seer.retina.width_px(left) / 2)
     range_m = point.norm(dim=-1)
     batch = Eyes(*(part[None] for part in pose))
@@ -182,7 +182,7 @@ def test_a_later_start_goes_on_as_the_whole_run():
     whole = simulate(task, scenes, world, alpha, keep=True)
     made = torch.tensor([0, 4, 2, 5, 1, 2])
     row = torch.arange(6)
-    memory = Memory(*(torch.stack(parts)[made, row] for parts in zip(*whole.memories, strict=True)))
+    memory = Known(*(torch.stack(parts)[made, row] for parts in zip(*whole.memories, strict=True)))
     later = simulate(task, scenes, world, alpha, (memory, made, whole.reward))
     torch.testing.assert_close(later.value, whole.value)
     torch.testing.assert_close(later.reward, whole.reward)

@@ -21,7 +21,6 @@ from torchfovea.sensing.triangulation import Observations
 
 AHEAD = torch.tensor([[1.0, 0, 0]], dtype=torch.float64)
 PRIOR, FUSION = Prior(), Fusion(gate_deg=5)
-ONE = torch.Size([])
 
 
 def look(rho: float, inlier: float = 1.0, fields: int = 9, sigma: float = 0.01) -> Observations:

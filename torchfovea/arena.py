@@ -1,4 +1,4 @@
-"""What an episode asks of the world: arenas to look around in, one by one or B at once, and the truth about them."""
+"""What a judged episode asks of the world: a robot that searches, and the truth; one by one or B at once."""
 
 from __future__ import annotations
 
@@ -9,25 +9,11 @@ import torch
 from torch import Tensor
 
 from torchfovea.memory.nearest import CellIndex, index_of_set, join_indices
-from torchfovea.sensing.correspondence import Correspondences
+from torchfovea.search import Look, Move, Robot
 from torchfovea.sensing.head import Gaze
 from torchfovea.setting import require
 
-__all__ = ["Arena", "Arenas", "Fixation", "Look", "Move", "Together", "Truth", "row", "stack"]
-
-
-class Move(NamedTuple):
-    """A saccade as executed, or B of them: numbers are tensors (B,) then.
-
-    Attributes:
-        gaze: where the head settled, as its encoders tell.
-        seconds: duration by the motor model.
-        degrees: travelled.
-    """
-
-    gaze: Gaze
-    seconds: float | Tensor
-    degrees: float | Tensor
+__all__ = ["Arena", "Arenas", "Fixation", "Truth", "row", "stack"]
 
 
 class Fixation(NamedTuple):
@@ -46,18 +32,6 @@ class Fixation(NamedTuple):
     is_target: bool | Tensor
 
 
-class Look(NamedTuple):
-    """What the eyes bring home from one fixation.
-
-    Attributes:
-        matches: correspondences in both retinas.
-        pictures: whatever the sensor wants drawn (images, disparity), or nothing.
-    """
-
-    matches: Correspondences
-    pictures: Any = None
-
-
 class Truth(NamedTuple):
     """What the judge knows and the observer does not.
 
@@ -72,40 +46,16 @@ class Truth(NamedTuple):
     cell_points: Tensor
 
 
-class Arena(Protocol):
-    """A place to look around in: simulated, or a robot's."""
+class Arena(Robot, Protocol):
+    """A place where a robot searches, or B robots in as many, beside a judge who knows the truth."""
 
-    def saccade(self, gaze: Gaze) -> Move:
-        """Move the head and wait until it rests."""
-        ...
-
-    def look(self, gaze: Gaze, generator: torch.Generator) -> Look:
-        """Sense at a gaze."""
-        ...
-
-    def fixation(self, gaze: Gaze) -> Fixation:
-        """The truth at a gaze."""
+    def fixation(self, gaze: Gaze, /) -> Fixation:
+        """The truth at a gaze (...)."""
         ...
 
 
-class Arenas(Protocol):
-    """B places that are looked around in together."""
-
-    def saccade(self, gaze: Gaze) -> Move:
-        """Move each head; gaze and all that comes back are (B,)."""
-        ...
-
-    def look(self, gaze: Gaze, generators: Sequence[torch.Generator]) -> Look:
-        """Sense at each gaze; the correspondences are (B, N)."""
-        ...
-
-    def fixation(self, gaze: Gaze) -> Fixation:
-        """The truth at each gaze."""
-        ...
-
-
-class Together:
-    """Arenas one after the other, as a batch.
+class Arenas:
+    """Arenas one after the other, as a batch; an `Arena` itself.
 
     Args:
         arenas: whose looks have the same number of receptive fields.

@@ -1,37 +1,30 @@
-"""Episodes: look, remember, decide, move, and be judged against the truth at every saccade (Sec. 7.2).
+"""Episodes: searches beside a judge, who knows the truth at every saccade (Sec. 7.2).
 
 B episodes advance together as tensors, one generator each, so that a batch is what its episodes are one by one.
 """
 
 from __future__ import annotations
 
-import time
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchfovea.arena import Arena, Arenas, Fixation, Look, Move, Together, Truth, row, stack
-from torchfovea.deciding.acquisition import known_well_enough
+from torchfovea.arena import Arena, Arenas, Fixation, Truth, row, stack
+from torchfovea.deciding.strategies import Strategy, upper_confidence_bound
 from torchfovea.memory.egosphere import Memory
 from torchfovea.metrics import gap, global_information, local_information, near_target, regret, saccades_to_target
-from torchfovea.perception import Observer, Step, decide, gaze_at, perceive
-from torchfovea.sensing.head import Gaze, eyes, fixate, gaze_point
+from torchfovea.perception import Observer, Step
+from torchfovea.search import Look, Move, StopRule, search
+from torchfovea.sensing.head import Gaze, gaze_point
 from torchfovea.setting import require
 
-__all__ = [
-    "Arena",
-    "Arenas",
-    "Episode",
-    "Fixation",
-    "Look",
-    "Move",
-    "Together",
-    "Truth",
-    "run_episode",
-    "run_episodes",
-]
+__all__ = ["Episode", "Rules", "run_episode", "run_episodes"]
+
+Each = Callable[[int, Look, Step], None]
 
 
 class Episode(NamedTuple):
@@ -78,17 +71,39 @@ class Episode(NamedTuple):
     looks: int
 
 
+@dataclass(frozen=True)
+class Rules:
+    """Of an episode.
+
+    Attributes:
+        saccades: T ≥ 1, the initial gaze included.
+        strategy: see `torchfovea.search.search`; for B episodes together its settings may be (B,).
+        stop: see `torchfovea.search.search`; the head then stays where it is until T.
+        far_m: what a fixation on the floor or on nothing counts as.
+        near_target_m: R_NN of Eq. 54.
+    """
+
+    saccades: int
+    strategy: Strategy = upper_confidence_bound
+    stop: StopRule | None = None
+    far_m: float = 6.0
+    near_target_m: float = 0.1
+
+    def __post_init__(self) -> None:
+        """Raise SettingError for no saccades, or distances that are none."""
+        require(self.saccades >= 1, "saccades", self.saccades, "at least 1")
+        for name in ("far_m", "near_target_m"):
+            require(0 < getattr(self, name) < math.inf, name, getattr(self, name), "a positive distance in metres")
+
+
 def run_episode(
     observer: Observer,
     memory: Memory,
     arena: Arena,
     truth: Truth,
-    saccades: int,
     generator: torch.Generator,
-    far_m: float = 6.0,
-    near_target_m: float = 0.1,
-    each: Callable[[int, Look, Step], None] | None = None,
-    stop: tuple[float, float] | None = None,
+    rules: Rules,
+    each: Each | None = None,
 ) -> Episode:
     """Run one episode from straight ahead; see `run_episodes`.
 
@@ -97,105 +112,71 @@ def run_episode(
         memory: what is known at the start, see `torchfovea.perception.new_memory`; its dtype is the episode's.
         arena: where.
         truth: for the metrics only.
-        saccades: T ≥ 1, the initial gaze included.
         generator: draws sensor noise and breaks ties; the same seed gives the same episode.
-        far_m: what a fixation on the floor or on nothing counts as.
-        near_target_m: R_NN of Eq. 54.
+        rules: how long, by which strategy, and what counts.
         each: called after every decision with t (from 0), the look and the step.
-        stop: see `run_episodes`.
 
     Raises:
-        SettingError: for no saccades or a nearest range that is not between 0 and far_m.
+        SettingError: for a nearest range that is not between 0 and far_m.
     """
 
     def show(t: int, look: Look, step: Step) -> None:
         if each is not None:
             each(t, Look(row(look.matches, 0), look.pictures[0]), row(step._replace(state=None), 0))
 
-    episode = run_episodes(
-        observer, stack([memory]), Together([arena]), [truth], saccades, [generator], far_m, near_target_m, show, stop
-    )[0]
+    episode = run_episodes(observer, stack([memory]), Arenas([arena]), [truth], [generator], rules, show)[0]
     return episode._replace(look=Look(episode.look.matches, episode.look.pictures[0]))
 
 
 def run_episodes(
     observer: Observer,
     memory: Memory,
-    arenas: Arenas,
+    arena: Arena,
     truths: Sequence[Truth],
-    saccades: int,
     generators: Sequence[torch.Generator],
-    far_m: float = 6.0,
-    near_target_m: float = 0.1,
-    each: Callable[[int, Look, Step], None] | None = None,
-    stop: tuple[float, float] | None = None,
+    rules: Rules,
+    each: Each | None = None,
 ) -> list[Episode]:
-    """Run B episodes together from straight ahead, on the device of the memories.
+    """Judge a search of B robots from straight ahead, on the device of the memories.
 
     Args:
-        observer: the fixed parts, alike for all; a strategy may have settings (B,).
+        observer: the fixed parts, alike for all.
         memory: B memories, see `torchfovea.arena.stack`.
-        arenas: where.
+        arena: of B robots, see `torchfovea.arena.Arenas`.
         truths: for the metrics only, B.
-        saccades: T ≥ 1, the initial gaze included.
         generators: one for each episode; the same seed gives the same episode, whatever the batch.
-        far_m: what a fixation on the floor or on nothing counts as.
-        near_target_m: R_NN of Eq. 54.
+        rules: how long, by which strategy, and what counts.
         each: called after every decision with t (from 0), the looks and the steps.
-        stop: (tolerance, probability) of `torchfovea.deciding.acquisition.known_well_enough`: when it holds, the best
-            cell is fixated, and the head stays there without another look; None: never.
 
     Raises:
-        SettingError: for no saccades or a nearest range that is not between 0 and far_m.
+        SettingError: for a nearest range that is not between 0 and far_m.
     """
-    require(saccades >= 1, "saccades", saccades, "at least 1")
+    saccades, far_m = rules.saccades, rules.far_m
     for truth in truths:
         require(0 < truth.nearest_m < far_m, "far_m", far_m, f"more than the nearest range, {truth.nearest_m:.3f} m")
-    cells = memory.cells
-    zero = cells.new_zeros(cells.shape[0])
-    gaze, done = Gaze(zero, zero, zero), torch.zeros_like(zero, dtype=torch.bool)
-    near = torch.stack([near_target(t.cell_points, t.nearest_point, near_target_m) for t in truths]).to(cells.device)
+    close = [near_target(t.cell_points, t.nearest_point, rules.near_target_m) for t in truths]
+    near = torch.stack(close).to(memory.cells.device)
     moves: list[Move] = []
     fixations: list[Fixation] = []
     gathered: list[Tensor] = []
     local: list[Tensor] = []
-    step: Step | None = None
-    looks, compute = torch.zeros_like(zero), 0.0
-    for t in range(saccades):
-        move = arenas.saccade(gaze)
-        executed = Gaze(*(angle.to(zero) for angle in move.gaze))
-        moves.append(move._replace(gaze=executed))
-        fixations.append(arenas.fixation(executed))
-        if bool(done.all()):  # nobody looks any more
-            left = saccades - t
-            moves += [Move(executed, 0 * move.seconds, 0 * move.degrees)] * (left - 1)
-            fixations += fixations[-1:] * (left - 1)
-            gathered, local = gathered + gathered[-1:] * left, local + local[-1:] * left
+    looks, compute = torch.zeros(len(truths), device=memory.cells.device), 0.0
+    for t, glance in enumerate(search(arena, observer, memory, saccades, generators, rules.strategy, rules.stop)):
+        moves.append(glance.move)
+        fixations.append(arena.fixation(glance.move.gaze))
+        if glance.look is None:
             break
-        start = time.perf_counter()
-        look = arenas.look(executed, generators)
-        looks = looks + ~done
-        matches = look.matches._replace(valid=look.matches.valid & ~done[:, None])
-        memory = perceive(observer, memory, matches, eyes(observer.head, executed))
-        step = decide(observer, memory, generators, executed, step)
-        compute += time.perf_counter() - start
-        gaze = step.gaze
-        if stop is not None:
-            last = known_well_enough(step.reward.mean, step.reward.std, step.eligible, *stop) & ~done
-            best = torch.where(step.eligible, step.reward.mean, -torch.inf).argmax(-1)
-            final = gaze_at(fixate(observer.head, step.points.mean)[0], best)
-            gaze = Gaze(
-                *(
-                    torch.where(done, now, torch.where(last, end, onward))
-                    for now, end, onward in zip(executed, final, gaze, strict=True)
-                )
-            )
-            done = done | last
+        look, step = glance.look, glance.step
+        looks, compute = looks + glance.looked, compute + glance.seconds
         gathered.append(global_information(step.points.cov))
         local.append(local_information(step.points.cov, near)[0])
         if each is not None:
             each(t, look, step)
-    assert step is not None
+    # after the search the heads stay where they are
+    still = moves[-1]._replace(seconds=0 * moves[-1].seconds, degrees=0 * moves[-1].degrees)
+    moves += [still] * (saccades - len(moves))
+    fixations += fixations[-1:] * (saccades - len(fixations))
+    gathered, local = (course + course[-1:] * (saccades - len(course)) for course in (gathered, local))
 
     def over_time(parts: Sequence[Any]) -> Tensor:
         return torch.stack([torch.as_tensor(part).cpu() for part in parts], -1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ from torchfovea.deciding.reward import (
     range_reward,
     user_reward,
 )
-from torchfovea.deciding.strategies import DEFAULT, Strategy, View, evaluate
+from torchfovea.deciding.strategies import Strategy, View, evaluate, upper_confidence_bound
 from torchfovea.gaussian import Gaussian, columns
 from torchfovea.memory.egosphere import (
     Fusion,
@@ -83,8 +83,9 @@ class Observer:
         prior: of a cell not yet seen.
         reward: `inverse_range` or `range`: near is good, in either measure (Eq. 36); or any function of points
             (..., 3) in E that returns a number for each (`torchfovea.deciding.reward.user_reward`).
-        acquisition: scores the cells, see `torchfovea.deciding.strategies`.
         eligibility: which cells may be fixated.
+
+    How it chooses among them is no part of it: `decide` and `torchfovea.search.search` take a `strategy`.
     """
 
     head: Head = field(default_factory=Head)
@@ -96,11 +97,13 @@ class Observer:
     fusion: Fusion = field(default_factory=Fusion)
     prior: Prior = field(default_factory=Prior)
     reward: str | Callable[[Tensor], Tensor] = "inverse_range"
-    acquisition: Strategy = DEFAULT
     eligibility: Eligibility = field(default_factory=Eligibility)
+    acquisition: InitVar[None] = None  # where strategies once were
 
-    def __post_init__(self) -> None:
-        """Raise SettingError for an unknown reward."""
+    def __post_init__(self, acquisition: None) -> None:
+        """Raise SettingError for an unknown reward, and for a strategy."""
+        given = getattr(acquisition, "__name__", type(acquisition).__name__)
+        require(acquisition is None, "Observer(acquisition)", given, "decide(..., strategy=) or search(..., strategy=)")
         known = self.reward in ("inverse_range", "range") or callable(self.reward)
         require(known, "reward", self.reward, "inverse_range, range or a function of points (..., 3)")
 
@@ -156,7 +159,7 @@ def perceive(
         memory: before.
         matches: the saccade's correspondences (..., N).
         eyes: where the eyes were.
-        common: what the receptive fields' errors share, see `torchfovea.memory.egosphere.remember`; by default what the
+        common: what the receptive fields' errors share, see `torchfovea.memory.update.remember`; by default what the
             head's encoders get wrong.
 
     Differentiable in the correspondences. Leaving out those that are not valid changes nothing: what each stands for
@@ -256,6 +259,7 @@ def decide(
     generator: Generators | None = None,
     gaze: Gaze | None = None,
     before: Step | None = None,
+    strategy: Strategy = upper_confidence_bound,
 ) -> Step:
     """Choose the next fixation (Eq. 41-43).
 
@@ -265,6 +269,7 @@ def decide(
         generator: breaks exact ties, and draws lots for the strategies that do; one, or one for each row.
         gaze: where the head looks now, (...), for strategies that mind the way; straight ahead if not given.
         before: the decision before, for strategies that remember.
+        strategy: scores the cells, see `torchfovea.deciding.strategies`.
 
     Raises:
         SettingError: for a memory of another chart or prior than the observer's.
@@ -294,7 +299,7 @@ def decide(
         generator,
         None if before is None else before.state,
     )
-    score, state = evaluate(observer.acquisition, view)
+    score, state = evaluate(strategy, view)
     cell = choose(score, eligible, generator)
     return Step(memory, points, reward, eligible, cell, gaze_at(target, cell), state)
 

@@ -8,12 +8,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchfovea.arena import stack
 from torchfovea.gaussian import columns
 from torchfovea.memory.egosphere import Memory
 from torchfovea.perception import Observer, new_memory
 from torchfovea.sensing.correspondence import Correspondences
 from torchfovea.sensing.fields import for_all
-from torchfovea.sensing.geometric import correspond_points
+from torchfovea.sensing.geometric import correspond_points, with_noise
 from torchfovea.sensing.head import Eyes, eyes, fixate, to_ego
 
 __all__ = ["Saccade", "batch_of", "flat_of", "moved_to", "part_of", "saccade", "shares", "support_of"]
@@ -27,12 +28,14 @@ class Saccade(NamedTuple):
         memory: an empty one.
         matches: of a look (N,).
         pose: of the eyes.
+        alpha: of the upper confidence bound that decides.
     """
 
     observer: Observer
     memory: Memory
     matches: Correspondences
     pose: Eyes
+    alpha: float = 1.0
 
 
 def moved_to(value: Any, device: str) -> Any:
@@ -52,7 +55,8 @@ def saccade(observer: Observer, cells: Tensor, device: str = "cpu", seed: int = 
     points = pose.t_left + distance * ray
     seen = torch.ones(len(left), dtype=torch.bool)
     generator = torch.Generator().manual_seed(seed)
-    matches = correspond_points(points, seen, left, pose, observer.camera, observer.retina, observer.budget, generator)
+    matches = correspond_points(points, seen, left, pose, observer.camera, observer.retina, observer.budget)
+    matches = with_noise(matches, observer.retina, generator)
     return moved_to(Saccade(observer, new_memory(observer, cells), matches, pose), device)
 
 
@@ -85,8 +89,7 @@ def batch_of(looks: Sequence[Saccade]) -> Saccade:
     first = looks[0]
     cells = torch.stack([look.memory.cells.cpu() for look in looks])
     device = str(first.memory.cells.device)
-    matches = [torch.stack(parts) for parts in zip(*(look.matches for look in looks), strict=True)]
-    matches = [columns(*part.unbind(-1)) if part.dim() == 3 else part for part in matches]
-    pose = Eyes(*(torch.stack(parts) for parts in zip(*(look.pose for look in looks), strict=True)))
+    matches, pose = (stack([getattr(look, part) for look in looks]) for part in ("matches", "pose"))
+    places = {part: columns(*getattr(matches, part).unbind(-1)) for part in ("left_px", "right_px")}
     memory = moved_to(new_memory(first.observer, columns(*cells.unbind(-1))), device)
-    return Saccade(first.observer, memory, Correspondences(*matches), pose)
+    return Saccade(first.observer, memory, matches._replace(**places), pose)

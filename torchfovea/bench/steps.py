@@ -13,13 +13,12 @@ from torch import Tensor
 from torchfovea.bench import peers
 from torchfovea.bench.look import Saccade, batch_of, flat_of, moved_to, part_of, saccade, shares, support_of
 from torchfovea.bench.timing import Growth, Path, Peer, nbytes, same
-from torchfovea.deciding.strategies import upper_confidence_bound
+from torchfovea.deciding.strategies import Strategy, upper_confidence_bound
 from torchfovea.gaussian import columns, unpack
 from torchfovea.memory.egosphere import Memory
 from torchfovea.perception import Observer, decide, new_memory, perceive
 from torchfovea.sensing.triangulation import observe
 from torchfovea.sensing.unscented import SigmaPoints
-from torchfovea.setting import require
 
 __all__ = ["batched_steps", "paths_of_steps"]
 
@@ -34,12 +33,8 @@ def _limits(observer: Observer) -> tuple[float, float]:
     return observer.eligibility.nearest_m, observer.eligibility.ground_z_m
 
 
-def _alpha(observer: Observer) -> float:
-    """Of the observer's upper confidence bound, which the peers compute too."""
-    strategy = observer.acquisition
-    known = isinstance(strategy, partial) and strategy.func is upper_confidence_bound and not strategy.args
-    require(known, "acquisition", getattr(strategy, "func", strategy), "ucb, in bench")
-    return float(strategy.keywords.get("alpha", 1.0)) if isinstance(strategy, partial) else 1.0
+def _strategy(look: Saccade) -> Strategy:
+    return partial(upper_confidence_bound, alpha=look.alpha)
 
 
 def _same_choice(what: str, ours: Any, theirs: peers.Choice, share: float) -> None:
@@ -57,10 +52,11 @@ def _decide(look: Saccade) -> Path:
     prior = (observer.prior.mean, observer.prior.std)
     cells, vector, matrix, bearing, seen = _known(memory)
     limits = _limits(observer)
-    ours = partial(decide, observer, memory)
+    choose = partial(decide, observer, strategy=_strategy(look))
+    ours = partial(choose, memory)
 
     def theirs() -> peers.Choice:
-        return peers.decide(cells, vector, matrix, bearing, seen, observer.head, prior, limits, _alpha(observer))
+        return peers.decide(cells, vector, matrix, bearing, seen, observer.head, prior, limits, look.alpha)
 
     def check() -> None:
         _same_choice("decide", ours(), theirs(), 0.999)
@@ -76,7 +72,7 @@ def _decide(look: Saccade) -> Path:
             lasting=columns(*memory.lasting[:size].unbind(-1)),
             votes=columns(*memory.votes[:size].unbind(-1)),
         )
-        return partial(decide, observer, less)
+        return partial(choose, less)
 
     done = ours()
     return Path(
@@ -92,7 +88,8 @@ def _decide(look: Saccade) -> Path:
 
 
 def _one_step(look: Saccade) -> Any:
-    return decide(look.observer, perceive(look.observer, look.memory, look.matches, look.pose))
+    memory = perceive(look.observer, look.memory, look.matches, look.pose)
+    return decide(look.observer, memory, strategy=_strategy(look))
 
 
 def _step(look: Saccade, full: Observer) -> list[Path]:
@@ -106,7 +103,7 @@ def _step(look: Saccade, full: Observer) -> list[Path]:
         peers.step, px, sigma, support, look.matches.valid.cpu().numpy(), rig, SigmaPoints(), cKDTree(cells),
         peers.tangent_frames(np, cells), memory.spacing_rad.cpu().numpy(), gates, vector, matrix, bearing,
         observer.prior.slope_std, observer.head, (observer.prior.mean, observer.prior.std), _limits(observer),
-        _alpha(observer),
+        look.alpha,
     )  # fmt: skip
     ours = partial(_one_step, look)
 

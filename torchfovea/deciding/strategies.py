@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -73,7 +72,7 @@ class View(NamedTuple):
 Strategy = Callable[[View], Tensor | tuple[Tensor, Any]]
 
 
-def upper_confidence_bound(view: View, alpha: float | Tensor = 1.0) -> Tensor:
+def upper_confidence_bound(view: View, alpha: float | Tensor = 2.0) -> Tensor:
     """μ + α σ (Eq. 41); `alpha` a number, inf allowed, or one for each row (...)."""
     return acquisition.upper_confidence_bound(view.mean, view.std, alpha)
 
@@ -257,7 +256,3 @@ def _source(view: View) -> Generators:
     require(view.generator is not None, "generator", None, "a torch.Generator, for this strategy draws lots")
     assert view.generator is not None
     return view.generator
-
-
-DEFAULT: Strategy = partial(upper_confidence_bound, alpha=2.0)
-"""The upper confidence bound with α = 2."""

@@ -21,7 +21,7 @@ from torchfovea.sensing.layout import Retina
 from torchfovea.sensing.own_layout import check_retina
 from torchfovea.sensing.unscented import SigmaPoints
 from torchfovea.setting import SettingError, require
-from torchfovea.sim.arena import Arena
+from torchfovea.sim.arena import SimulatedArena
 from torchfovea.sim.motor import Motor
 from torchfovea.sim.rays import Renderer
 from torchfovea.sim.scene import Room, Scene, build_scene
@@ -161,7 +161,7 @@ def build_motor(cfg: DictConfig) -> Callable[[Scene], Motor]:
     return motor_of
 
 
-def build_arena(cfg: DictConfig, observer: Observer, seed: int) -> Arena:
+def build_arena(cfg: DictConfig, observer: Observer, seed: int) -> SimulatedArena:
     """The simulated world of an episode."""
     scene = build_scene_of(cfg, observer.head, seed)
     fidelity = choice(cfg, "fidelity", ("photometric", "geometric"))
@@ -175,7 +175,7 @@ def build_arena(cfg: DictConfig, observer: Observer, seed: int) -> Arena:
     )
     match = build_match(cfg)  # checked even where it is not used
     sample = None if OmegaConf.select(cfg, "sensor.sample") is None else whole(cfg, "sensor.sample", 16)
-    return Arena(world, observer, None if fidelity == "geometric" else match, sample, seed)
+    return SimulatedArena(world, observer, None if fidelity == "geometric" else match, sample, seed)
 
 
 def build_match(cfg: DictConfig) -> Match:

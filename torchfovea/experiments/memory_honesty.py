@@ -19,7 +19,7 @@ from torchfovea.metrics import coverage, nees_mean, outlier_share
 from torchfovea.perception import Observer, new_memory, perceive
 from torchfovea.sensing.head import Gaze, eyes
 from torchfovea.setting import require
-from torchfovea.sim.arena import Arena
+from torchfovea.sim.arena import SimulatedArena
 from torchfovea.stereo.rig import verged
 from torchfovea.stereo.views import verged_views
 from torchfovea.studies.significance import bootstrap_interval
@@ -43,7 +43,7 @@ class Sensor(NamedTuple):
     """
 
     observer: Observer
-    arena: Arena
+    arena: SimulatedArena
     memories: dict[int, Memory]
 
 

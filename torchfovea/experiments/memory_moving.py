@@ -16,7 +16,7 @@ from torchfovea.memory.moving import Motion, motion, move, resample
 from torchfovea.metrics import gap
 from torchfovea.perception import Observer, decide, new_memory, perceive
 from torchfovea.sensing.head import Gaze, eyes, fixate
-from torchfovea.sim.arena import Arena
+from torchfovea.sim.arena import SimulatedArena
 from torchfovea.sim.scene import EgoPose, stand_at
 from torchfovea.sim.world import World
 
@@ -26,7 +26,7 @@ FIRST_LOOKS = 5  # before the first move, or before the cells are drawn anew
 ODOMETRY_M, ODOMETRY_RAD = 0.005, math.radians(0.3)  # a step's errors along x and y, and of the turn
 
 
-def _look(observer: Observer, memory: Memory, arena: Arena, gaze: Gaze, generator: torch.Generator) -> Memory:
+def _look(observer: Observer, memory: Memory, arena: SimulatedArena, gaze: Gaze, generator: torch.Generator) -> Memory:
     told = Gaze(*(a.to(memory.cells) for a in arena.saccade(gaze).gaze))
     return perceive(observer, memory, arena.look(told, generator).matches, eyes(observer.head, told))
 
@@ -74,7 +74,7 @@ def study_moving(cfg: DictConfig, rows: Rows) -> None:
                     pose, step = _walk(pose, generator)
                     memory = move(memory, step, observer.fusion)
                     world = World(stand_at(scene, pose), camera=observer.camera, source_px=arena.world.source_px)
-                    arena = Arena(world, observer, arena.matcher, arena.sample, k)
+                    arena = SimulatedArena(world, observer, arena.matcher, arena.sample, k)
                     for gaze in list(fixation_course(arena, cells, looks + 1, 1000 * t + k))[1:]:
                         memory = _look(observer, memory, arena, gaze, generator)
                 if t in marks:

@@ -20,7 +20,7 @@ from torchfovea.sensing.chart import basis
 from torchfovea.sensing.head import Gaze, eyes, fixate
 from torchfovea.sensing.layout import LogPolar, Retina, Uniform
 from torchfovea.sensing.unscented import SigmaPoints
-from torchfovea.sim.arena import Arena
+from torchfovea.sim.arena import SimulatedArena
 from torchfovea.sim.world import World
 
 __all__ = [
@@ -127,7 +127,7 @@ def estimate(memory: Memory) -> tuple[Tensor, Tensor, Tensor]:
     return 1 / r, quadratic3(moments.cov, moments.mean / r[..., None]) / r**4, memory.looks > 0
 
 
-def fixation_course(arena: Arena, cells: Tensor, saccades: int, seed: int) -> Iterator[Gaze]:
+def fixation_course(arena: SimulatedArena, cells: Tensor, saccades: int, seed: int) -> Iterator[Gaze]:
     """Straight ahead, then true points of cells at random; every fifth fixation is the target."""
     generator = torch.Generator().manual_seed(seed)
     head, world = arena.observer.head, arena.world

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any
@@ -11,15 +10,16 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from torchfovea.arena import Look, Truth, stack
+from torchfovea.arena import Truth, stack
 from torchfovea.deciding.strategies import Strategy
-from torchfovea.episode import Episode, run_episode, run_episodes
+from torchfovea.episode import Episode, Rules, run_episode, run_episodes
 from torchfovea.experiments.build import build_arena, build_cells, build_motor, build_scene_of, name_of
 from torchfovea.experiments.memories import loaded_memory
 from torchfovea.experiments.settings import choice, number, whole
 from torchfovea.experiments.strategy import build_stop, build_strategy
 from torchfovea.memory.egosphere import Memory
 from torchfovea.perception import Observer, Step, new_memory
+from torchfovea.search import Look
 from torchfovea.sensing.head import Head
 from torchfovea.setting import require
 from torchfovea.sim.arenas import GeometricArenas
@@ -63,11 +63,13 @@ def one_episode(
     if memory is None:
         memory = new_memory(observer, build_cells(_aimed(cfg, arena.world.scene), observer.head, generator))
     truth = arena.truth(memory.cells)
-    observer = dataclasses.replace(observer, acquisition=build_strategy(cfg, observer, _aim(truth)))
-    return run_episode(
-        observer, memory, arena, truth, whole(cfg, "saccades"), generator, number(cfg, "far_m"),
-        number(cfg, "near_target_m"), each, build_stop(cfg),
-    )  # fmt: skip
+    rules = _rules(cfg, build_strategy(cfg, observer, _aim(truth)))
+    return run_episode(observer, memory, arena, truth, generator, rules, each)
+
+
+def _rules(cfg: DictConfig, strategy: Strategy) -> Rules:
+    far_m, near_target_m = number(cfg, "far_m"), number(cfg, "near_target_m")
+    return Rules(whole(cfg, "saccades"), strategy, build_stop(cfg), far_m, near_target_m)
 
 
 def _aim(truth: Truth) -> Tensor:
@@ -109,9 +111,8 @@ def prepare(cfg: DictConfig, observer: Observer, seed: int) -> tuple[Scene, Memo
     generator, memory = torch.Generator().manual_seed(seed), loaded_memory(cfg, observer)
     if memory is not None:
         return scene, memory, truth_of(scene, memory.cells), generator
-    plain = dataclasses.replace(observer, acquisition=Observer().acquisition)
     cells = OmegaConf.masked_copy(_aimed(cfg, scene), ["memory"])
-    memory, state = _start(OmegaConf.to_yaml(cells, resolve=True), plain, seed)
+    memory, state = _start(OmegaConf.to_yaml(cells, resolve=True), observer, seed)
     generator.set_state(state)
     return scene, memory, truth_of(scene, memory.cells), generator
 
@@ -142,16 +143,13 @@ def roll_out(
     else:
         chosen = strategy(truths)
     return run_episodes(
-        dataclasses.replace(observer, acquisition=chosen),
+        observer,
         memory,
         GeometricArenas(scenes, observer, sample_of(cfg), device, build_motor(cfg)(scenes[0]), seeds),
         truths,
-        whole(cfg, "saccades"),
         generators,
-        number(cfg, "far_m"),
-        number(cfg, "near_target_m"),
+        _rules(cfg, chosen),
         each,
-        build_stop(cfg),
     )
 
 

@@ -11,7 +11,6 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
 
-from torchfovea.arena import Look
 from torchfovea.config import run_folder
 from torchfovea.episode import Episode
 from torchfovea.experiments.build import build_match, build_motor, build_observer, build_renderer, name_of
@@ -26,6 +25,7 @@ from torchfovea.files import write_csv
 from torchfovea.memory.store import save_memory
 from torchfovea.metrics import phantom
 from torchfovea.perception import Observer, Step
+from torchfovea.search import Look
 from torchfovea.setting import require
 
 __all__ = ["EPISODE_COLUMNS", "SACCADE_COLUMNS", "episode_row", "run", "saccade_rows", "summarize"]

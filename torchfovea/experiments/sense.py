@@ -109,9 +109,9 @@ def sense(
     """Correspondences of a rectified pair as points with covariances, in the left camera's frame."""
     eye = torch.eye(3)
     rig = Eyes(eye, torch.zeros(3), eye, torch.tensor([views.rig.baseline_m, 0.0, 0.0]))
-    px, (camera, right_camera) = matches.left_px, views.cameras(retina)
+    px, cameras = matches.left_px, views.cameras(retina)
     support = torch.full_like(px[..., 0], 0.5) if retina is None else retina.width_px(px) / 2
-    observed = _doubted(observe(matches, rig, camera, support, points, "inverse_range", rotated, right_camera))
+    observed = _doubted(observe(matches, rig, cameras, support, points, "inverse_range", rotated))
     moments = cartesian_from_inverse_range(Gaussian(observed.mean, observed.cov), observed.direction)
     if retina is None:
         colour, chosen = views.left.flatten(1).T, observed.valid

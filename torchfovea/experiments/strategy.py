@@ -15,10 +15,10 @@ from torchfovea.deciding import strategies
 from torchfovea.deciding.strategies import Strategy, View
 from torchfovea.experiments.named import build_named, name_of
 from torchfovea.perception import Observer
+from torchfovea.search import StopRule
 from torchfovea.setting import require
 
 __all__ = [
-    "StopRule",
     "build_stop",
     "build_strategy",
     "ei_cost",
@@ -32,8 +32,6 @@ __all__ = [
 ]
 
 FORM = "a function of a View that returns a score for each cell"
-
-StopRule = tuple[float, float]
 
 
 def read_number(cfg: DictConfig, setting: str, expected: str, least: float = -math.inf) -> float:

@@ -13,7 +13,7 @@ from torchfovea.sensing.correspondence import Budget, Correspondences, eye_sigma
 from torchfovea.sensing.head import Eyes, to_ego
 from torchfovea.sensing.layout import Retina
 
-__all__ = ["correspond_points"]
+__all__ = ["correspond_points", "with_noise"]
 
 
 def correspond_points(
@@ -24,9 +24,8 @@ def correspond_points(
     camera: Camera,
     retina: Retina,
     budget: Budget,
-    generator: torch.Generator | Sequence[torch.Generator] | None,
 ) -> Correspondences:
-    """What both retinas would report of surface points that the left receptive fields look at (Eq. 6-7).
+    """Where both retinas would see surface points that the left receptive fields look at (Eq. 6-7), without noise.
 
     Args:
         points: the surface point along each left receptive field's ray, (..., N, 3) in E [m].
@@ -36,7 +35,6 @@ def correspond_points(
         camera: both eyes' camera.
         retina: both eyes' retina.
         budget: where the standard deviations come from.
-        generator: draws the noise, one or one for each row of a batch (B, N); None: no noise.
 
     Returns:
         Correspondences; invalid where not visible or outside the right retina. Differentiable in points and poses.
@@ -48,12 +46,25 @@ def correspond_points(
     right_px = torch.where(valid[..., None], right_px, torch.zeros_like(right_px))
     left_px = left_px.expand_as(right_px)
     left_sigma, right_sigma = eye_sigma_px(budget, retina, left_px), eye_sigma_px(budget, retina, right_px)
-    if generator is not None:
-        noise = _noise(valid.shape, generator, points)
-        left_px = left_px + columns(left_sigma * noise[0], left_sigma * noise[1])
-        right_px = right_px + columns(right_sigma * noise[2], right_sigma * noise[3])
     support, sure = retina.width_px(left_px) / 2, torch.ones_like(left_sigma)
     return Correspondences(left_px, right_px, left_sigma, right_sigma, valid, sure, support)
+
+
+def with_noise(
+    matches: Correspondences, retina: Retina, generator: torch.Generator | Sequence[torch.Generator]
+) -> Correspondences:
+    """Both places moved by chance as far as their standard deviations say.
+
+    Args:
+        matches: from `correspond_points`, (..., N).
+        retina: both eyes'.
+        generator: one, or one for each row of a batch (B, N).
+    """
+    noise = _noise(matches.valid.shape, generator, matches.left_px)
+    left, right = matches.left_sigma_px, matches.right_sigma_px
+    left_px = matches.left_px + columns(left * noise[0], left * noise[1])
+    right_px = matches.right_px + columns(right * noise[2], right * noise[3])
+    return matches._replace(left_px=left_px, right_px=right_px, support_px=retina.width_px(left_px) / 2)
 
 
 def _noise(shape: torch.Size, generator: torch.Generator | Sequence[torch.Generator], like: Tensor) -> Tensor:

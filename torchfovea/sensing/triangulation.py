@@ -153,25 +153,23 @@ class _Rig(NamedTuple):
 def observe(
     matches: Correspondences,
     eyes: Eyes,
-    camera: Camera,
+    camera: Camera | tuple[Camera, Camera],
     support_px: Tensor,
     points: SigmaPoints | None = None,
     chart: str = "inverse_range",
     rotated: bool = True,
-    right_camera: Camera | None = None,
 ) -> Observations:
     """Correspondences as Gaussian points in E: the unscented transform through triangulation (Eq. 6-18, 22-27).
 
     Args:
         matches: correspondences (..., N) with their retinal standard deviations.
         eyes: poses of the cameras in E, (...).
-        camera: both eyes' camera, or the left one's, in retinal pixels.
+        camera: both eyes' camera, or the left one's and the right one's, in retinal pixels.
         support_px: half the width of each left receptive field, (..., N) or (N,) [px].
         points: sigma points of four dimensions; None: `SigmaPoints()`, in the Cartesian chart
             `SigmaPoints.midpoint()`.
         chart: `inverse_range` or `cartesian`.
         rotated: see `torchfovea.sensing.unscented.sigma_root`.
-        right_camera: where the right eye has another.
 
     Returns:
         Observations. Valid are those whose nine sigma points all lie in front of both eyes (in inverse range: whose
@@ -188,7 +186,7 @@ def observe(
     batch, count = matches.valid.shape[:-1], matches.valid.shape[-1]
     eyes = Eyes(*(part.expand(*batch, *part.shape[-k:]) for part, k in zip(eyes, (2, 1, 2, 1), strict=True)))
     frame, origin, baseline = rig_frame(eyes)
-    cameras = camera, right_camera or camera
+    cameras = camera if isinstance(camera, tuple) else (camera, camera)
     rig = _Rig(frame, origin, baseline, frame.mT @ eyes.R_left, frame.mT @ eyes.R_right, *cameras)
     transform = partial(_transform, rig=rig, points=points, chart=chart, rotated=rotated)
     if chart == "inverse_range" and isinstance(cameras[0], Pinhole) and isinstance(cameras[1], Pinhole):
@@ -205,8 +203,8 @@ def observe(
         part = Correspondences(*(t.narrow(axis, start, min(size, count - start)) for t, axis in axes))
         parts.append(_settled(part, *transform(part)))
     value, direction, valid = (p[0] if len(p) == 1 else torch.cat(p, -1) for p in zip(*parts, strict=True))
-    x, y, z = camera.ray_components(*matches.left_px.unbind(-1))
-    support = support_px / camera.focal_px * torch.addcmul(torch.addcmul(z * z, x, x), y, y).rsqrt()
+    x, y, z = cameras[0].ray_components(*matches.left_px.unbind(-1))
+    support = support_px / cameras[0].focal_px * torch.addcmul(torch.addcmul(z * z, x, x), y, y).rsqrt()
     mean, cov = value[:3].movedim(0, -1), value[3:].movedim(0, -1)
     inlier = valid.to(mean.dtype) if matches.inlier is None else matches.inlier
     return Observations(mean, cov, direction.movedim(0, -1), support.expand(valid.shape), valid, inlier, chart)

@@ -1,4 +1,4 @@
-"""The simulated arena of an episode: a MuJoCo world behind the interface that a robot would offer too."""
+"""The simulated arena of an episode: a MuJoCo world behind the interface that a robot offers too, and the truth."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchfovea.arena import Fixation, Look, Move, Truth
+from torchfovea.arena import Fixation, Truth
 from torchfovea.perception import Observer
+from torchfovea.search import Look, Move
 from torchfovea.sensing.correspondence import Disparity
 from torchfovea.sensing.fields import draw_fields, for_all
-from torchfovea.sensing.geometric import correspond_points
+from torchfovea.sensing.geometric import correspond_points, with_noise
 from torchfovea.sensing.head import Gaze, eyes
 from torchfovea.sim.truth import truth_of
 from torchfovea.sim.world import World
@@ -21,7 +22,7 @@ from torchfovea.stereo.rig import verged
 from torchfovea.stereo.sweep import SweepRange
 from torchfovea.stereo.views import verged_views
 
-__all__ = ["Arena", "Pictures"]
+__all__ = ["Pictures", "SimulatedArena"]
 
 
 class Pictures(NamedTuple):
@@ -38,7 +39,7 @@ class Pictures(NamedTuple):
     found: Disparity | SweepRange | Any
 
 
-class Arena:
+class SimulatedArena:
     """A world seen by an observer, photometric or geometric.
 
     Args:
@@ -99,8 +100,9 @@ class Arena:
         visible = seen.hit & seen.visible_right
         pose = eyes(observer.head, gaze)
         matches = correspond_points(
-            seen.points_e, visible, left_px, pose, observer.camera, observer.retina, observer.budget, generator
+            seen.points_e, visible, left_px, pose, observer.camera, observer.retina, observer.budget
         )
+        matches = with_noise(matches, observer.retina, generator)
         return Look(matches if chosen is None else for_all(matches, observer.retina))
 
     def truth(self, cells: Tensor) -> Truth:

@@ -8,10 +8,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchfovea.arena import Fixation, Look, Move
+from torchfovea.arena import Fixation
 from torchfovea.perception import Observer
+from torchfovea.search import Look, Move
 from torchfovea.sensing.fields import draw_fields, for_all
-from torchfovea.sensing.geometric import correspond_points
+from torchfovea.sensing.geometric import correspond_points, with_noise
 from torchfovea.sensing.head import Gaze, clamp_gaze, cyclopean, eyes, to_ego
 from torchfovea.setting import require
 from torchfovea.sim.model import Scene
@@ -23,7 +24,7 @@ __all__ = ["GeometricArenas"]
 
 
 class GeometricArenas:
-    """B scenes seen by observers of one kind: what `torchfovea.sim.arena.Arena` does for one.
+    """B scenes seen by observers of one kind: what `torchfovea.sim.arena.SimulatedArena` does for one.
 
     Args:
         scenes: B, built for the observer's head; one may appear several times.
@@ -31,7 +32,7 @@ class GeometricArenas:
         sample: how many receptive fields a look goes through, drawn anew each time; None: all of them.
         device: where rays are traced, in float64.
         motor: its model of durations.
-        seeds: of each row's encoder noise, see `torchfovea.sim.arena.Arena`; by default 0, 1, ...
+        seeds: of each row's encoder noise, see `torchfovea.sim.arena.SimulatedArena`; by default 0, 1, ...
     """
 
     def __init__(
@@ -98,9 +99,8 @@ class GeometricArenas:
         if some:
             left_px = left_px[torch.stack([index for index in chosen if index is not None]).to(device)]
         points, visible = self._surfaces(gaze, observer.camera.rays(left_px))
-        matches = correspond_points(
-            points, visible, left_px, pose, observer.camera, observer.retina, observer.budget, generators
-        )
+        matches = correspond_points(points, visible, left_px, pose, observer.camera, observer.retina, observer.budget)
+        matches = with_noise(matches, observer.retina, generators)
         return Look(for_all(matches, observer.retina) if some else matches)
 
     def _surfaces(self, gaze: Gaze, left_rays: Tensor) -> tuple[Tensor, Tensor]:

@@ -78,9 +78,9 @@ def checked_matches(answer: object, retina: Retina) -> tuple[Correspondences, An
     require(pair, "matcher", f"{type(answer).__name__} from (views, retina, budget)", expected)
     assert isinstance(answer, tuple)
     matches = answer[0]
-    for name, lead in (("left_px", 2), ("right_px", 2), ("left_sigma_px", 1), ("right_sigma_px", 1), ("valid", 1)):
-        part = getattr(matches, name)
-        shape = (retina.count, 2)[:lead]
+    for name, part in matches._asdict().items():
+        shape = (retina.count, 2)[: 2 if name in ("left_px", "right_px") else 1]
         fits = isinstance(part, Tensor) and tuple(part.shape) == shape
+        fits = fits or (part is None and name in matches._field_defaults)
         require(fits, f"matcher's {name}", getattr(part, "shape", part), f"{shape}, one for each receptive field")
     return matches, answer[1]

@@ -126,9 +126,8 @@ def judged(
     left, right = (px.detach().clone().requires_grad_() for px in (matches.left_px, matches.right_px))
     width = retina.width_px(matches.left_px)
     with torch.enable_grad():
-        observed = observe(
-            matches._replace(left_px=left, right_px=right), pose, camera, width / 2, points, right_camera=right_camera
-        )
+        cameras = camera, right_camera or camera
+        observed = observe(matches._replace(left_px=left, right_px=right), pose, cameras, width / 2, points)
         rho = observed.mean[..., 2]
         slopes = torch.autograd.grad(rho.sum(), (left, right))
     truth = inverse_range.to(rho)

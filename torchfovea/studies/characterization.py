@@ -167,7 +167,7 @@ def correspond_plane(
     """
     rays = to_ego(pose.R_left, sensor.camera.rays(left_px))
     points, meets = plane_points(rays, pose.t_left.unsqueeze(-2), distance_m)
-    return correspond_points(points, meets, left_px, pose, sensor.camera, sensor.retina, sensor.budget, None), points
+    return correspond_points(points, meets, left_px, pose, sensor.camera, sensor.retina, sensor.budget), points
 
 
 def elementwise_jacobian(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ from torch import Tensor
 from torchfovea.tuning.bias import Bias, log_density_each, log_normalizer_each
 from torchfovea.tuning.problem import Batch, Problem, play, prepare
 from torchfovea.tuning.scenes import Scenes, cast, nearest_point
-from torchfovea.tuning.simulator import Memory, World, blank, simulate
+from torchfovea.tuning.simulator import Known, World, blank, simulate
 
 __all__ = [
     "Credit",
@@ -171,7 +171,7 @@ def _removals(problem: Problem, bias: Bias, batch: Batch, alpha_share: float = 0
     of = torch.cat((scene, part, part))
     made = torch.cat((first[scene, cell] - 1, torch.zeros(2 * m, dtype=torch.long)))
     steps = torch.cat((torch.zeros(k), torch.full((m,), _ALPHA_STEP), torch.full((m,), -_ALPHA_STEP)))
-    memory = Memory(*(torch.stack(parts)[made, of] for parts in zip(*run.memories, strict=True)))
+    memory = Known(*(torch.stack(parts)[made, of] for parts in zip(*run.memories, strict=True)))
     other = world.take(of)
     other.allowed[torch.arange(k), cell] = False
     start = (memory, made, run.reward[of])

@@ -13,7 +13,7 @@ from torchfovea.setting import require
 from torchfovea.tuning.bias import draw_cells, log_density_each, log_normalizer_each
 from torchfovea.tuning.estimators import Credit, Gradient, finish
 from torchfovea.tuning.problem import Batch, Problem, prepare
-from torchfovea.tuning.simulator import Memory, empty, glance, score, simulate, world_of
+from torchfovea.tuning.simulator import Known, empty, glance, score, simulate, world_of
 
 __all__ = ["myopic"]
 
@@ -87,7 +87,7 @@ def myopic(problem: Problem, vector: Tensor, batch: Batch, alpha_share: float = 
         spread = torch.where(at_self, self_variance, variance.gather(-1, now)[..., 0])
         gained = shown / spread
         measured = 1 / world.range_m + spread.sqrt() * noise[t]
-        memory = Memory(memory.precision + gained, memory.vector + gained * measured, memory.seen | shown)
+        memory = Known(memory.precision + gained, memory.vector + gained * measured, memory.seen | shown)
         value = score(task, world, memory, bias.alpha)[0]
         rival, cell = base.score.gather(1, pointer + 1), base.cell.gather(1, pointer + 1)
         at_self = (value > rival) | ((value == rival) & torch.isfinite(value) & (slot[:, None] < cell))

@@ -17,7 +17,7 @@ from torchfovea.tuning.bias import draw_cells, reachable
 from torchfovea.tuning.estimators import Gradient, alpha_difference
 from torchfovea.tuning.problem import Batch, Problem, prepare
 from torchfovea.tuning.scenes import Scenes, cast
-from torchfovea.tuning.simulator import Memory, World, blank, empty, look, score, world_of
+from torchfovea.tuning.simulator import Known, World, blank, empty, look, score, world_of
 
 __all__ = ["panorama", "pathwise"]
 
@@ -99,7 +99,7 @@ def _soft_episode(problem: Problem, batch: Batch, world: World, reward: Tensor, 
     room = (-batch.scenes.nearest_m - first).clamp(min=1e-6)
     course = [torch.zeros_like(best)]
     for t in range(task.saccades - 1):
-        memory = Memory(*look(task, world, memory, eyes(task.observer.head, gaze), t))
+        memory = Known(*look(task, world, memory, eyes(task.observer.head, gaze), t))
         value, point = score(task, world, memory, alpha.detach())
         some = torch.isfinite(value).any(-1, keepdim=True)
         policy = torch.where(some, value, torch.zeros_like(value)).div(_TEMPERATURE).softmax(-1)

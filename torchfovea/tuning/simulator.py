@@ -27,7 +27,7 @@ from torchfovea.setting import require
 from torchfovea.tuning.scenes import Scenes, cast
 
 __all__ = [
-    "Memory", "Run", "Task", "World", "best_cell", "blank", "check_observer", "empty", "glance", "look", "score",
+    "Known", "Run", "Task", "World", "best_cell", "blank", "check_observer", "empty", "glance", "look", "score",
     "simulate", "true_reward", "world_of", "worth",
 ]  # fmt: skip
 
@@ -75,7 +75,7 @@ class World(NamedTuple):
         return World(d[index], r[index], n[:, index], a[index], m[index], p[index])
 
 
-class Memory(NamedTuple):
+class Known(NamedTuple):
     """Scalar information filters of inverse range.
 
     Attributes:
@@ -106,7 +106,7 @@ class Run(NamedTuple):
     cell: Tensor
     score: Tensor
     gaze: Gaze
-    memories: list[Memory]
+    memories: list[Known]
 
 
 def check_observer(observer: Observer) -> None:
@@ -116,10 +116,10 @@ def check_observer(observer: Observer) -> None:
     require(observer.fusion.chart == "inverse_range", "fusion", observer.fusion.name, "inverse_range, in tuning")
 
 
-def empty(world: World) -> Memory:
+def empty(world: World) -> Known:
     """Nothing seen yet."""
     none = torch.zeros_like(world.allowed)
-    return Memory(world.prior_precision, world.prior_precision * world.prior_mean, none)
+    return Known(world.prior_precision, world.prior_precision * world.prior_mean, none)
 
 
 def world_of(task: Task, scenes: Scenes, cells: Tensor, noise: Tensor) -> World:
@@ -176,16 +176,16 @@ def glance(observer: Observer, pose: Eyes, point: Tensor, direction: Tensor, ran
     return visible, (spread / range_m.square().square()).clamp(min=1e-12)
 
 
-def look(task: Task, world: World, memory: Memory, pose: Eyes, t: int) -> Memory:
+def look(task: Task, world: World, memory: Known, pose: Eyes, t: int) -> Known:
     """Fuse one saccade's observations into the memory."""
     point = world.direction * world.range_m[..., None]
     visible, variance = glance(task.observer, pose, point, world.direction, world.range_m)
     weight = visible / variance
     measured = 1 / world.range_m + variance.sqrt() * world.noise[t]
-    return Memory(memory.precision + weight, memory.vector + weight * measured, memory.seen | visible)
+    return Known(memory.precision + weight, memory.vector + weight * measured, memory.seen | visible)
 
 
-def score(task: Task, world: World, memory: Memory, alpha: Tensor) -> tuple[Tensor, Tensor]:
+def score(task: Task, world: World, memory: Known, alpha: Tensor) -> tuple[Tensor, Tensor]:
     """Upper confidence bound of every cell.
 
     Args:
@@ -254,7 +254,7 @@ def simulate(
     scenes: Scenes,
     world: World,
     alpha: Tensor,
-    start: tuple[Memory, Tensor, Tensor] | None = None,
+    start: tuple[Known, Tensor, Tensor] | None = None,
     keep: bool = False,
 ) -> Run:
     """Run B episodes with the hard policy.
@@ -276,7 +276,7 @@ def simulate(
     cells = torch.full((n, steps), -1)
     scores = torch.full((n, steps), -math.inf, dtype=zero.dtype)
     angles = torch.zeros(3, n, steps, dtype=zero.dtype)
-    memories: list[Memory] = []
+    memories: list[Known] = []
     alpha = alpha.to(zero).expand(n)
     if start is None:
         memory = look(task, world, empty(world), eyes(task.observer.head, Gaze(zero, zero, zero)), 0)
@@ -284,7 +284,7 @@ def simulate(
     else:
         memory, made, earlier = start
         order = made.argsort(stable=True)  # those that begin first come first: the live ones are a slice
-        memory, world = Memory(*(m[order] for m in memory)), world.take(order)
+        memory, world = Known(*(m[order] for m in memory)), world.take(order)
         alpha, made = alpha[order], made[order]
     for t in range(steps - 1):
         live = int((made <= t).sum())
@@ -292,7 +292,7 @@ def simulate(
             continue
         part = slice(0, live)
         w = world if live == n else World(*(f[:, part] if i == 2 else f[part] for i, f in enumerate(world)))
-        m = memory if live == n else Memory(*(f[part] for f in memory))
+        m = memory if live == n else Known(*(f[part] for f in memory))
         if keep:
             memories.append(m)
         value, point = score(task, w, m, alpha[part])
@@ -303,7 +303,7 @@ def simulate(
         angles[:, part, t + 1] = torch.stack(now)
         if t + 2 < steps:
             m = look(task, w, m, eyes(task.observer.head, now), t + 1)
-            memory = m if live == n else Memory(*(torch.cat((a, b[live:])) for a, b in zip(m, memory, strict=True)))
+            memory = m if live == n else Known(*(torch.cat((a, b[live:])) for a, b in zip(m, memory, strict=True)))
     back = order.argsort()
     cells, scores, gaze, made = cells[back], scores[back], Gaze(*angles[:, back]), made[back]
     reward = true_reward(task, scenes, gaze)
