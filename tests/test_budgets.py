@@ -13,7 +13,7 @@ from synthetic import observations, without_clues
 
 from torchfovea.cli import main
 from torchfovea.config import conf_dir
-from torchfovea.experiments.budgets import build_budget, made_for, shipped, write_budget
+from torchfovea.experiments.budgets import build_budget, load_budget, made_for, shipped, write_budget
 from torchfovea.experiments.pairs import load_folder, named_pair
 from torchfovea.experiments.regions import REGIONS, hidden_places, regions, truth_step_px
 from torchfovea.sensing.correspondence import Budget, Clues, doubt, inlier_share
@@ -276,3 +276,12 @@ def test_a_spoilt_folder_is_one_line(tmp_path, spoil, line):
     spoil(folder)
     with pytest.raises(SettingError, match=line):
         named_pair(str(folder), "pairs[0]")
+
+
+@pytest.mark.parametrize("name", ["log_polar_sgbm", "uniform_sweep_rendered", "printed", "ours"])
+def test_a_budget_is_read_by_its_name(name):
+    budget = load_budget(name, 300)
+    assert budget.source_px == (None if name == "printed" else 300)
+    assert (budget.outliers > 0) == ("_" in name)
+    with pytest.raises(SettingError, match=r"budget = nobody's: expected one of .*log_polar_sgbm"):
+        load_budget("nobody's")

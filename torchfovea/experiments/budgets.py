@@ -15,7 +15,7 @@ from torchfovea.files import replacing
 from torchfovea.sensing.correspondence import Budget
 from torchfovea.setting import SettingError, require
 
-__all__ = ["build_budget", "made_for", "shipped", "write_budget"]
+__all__ = ["build_budget", "load_budget", "made_for", "shipped", "write_budget"]
 
 NUMBERS = tuple(field.name for field in fields(Budget) if field.name != "source_px")
 KEYS = (*NUMBERS, "source", "sigma_points", "made_for")
@@ -43,6 +43,23 @@ def build_budget(cfg: DictConfig, pair: bool = False) -> Budget:
         _compare(cfg, node["made_for"], pair)
     source = whole(cfg, "sensor.source_px", 16) if node["source"] else None
     return construct(Budget, {**{name: node[name] for name in NUMBERS}, "source_px": source}, "budget")
+
+
+def load_budget(name: str, source_px: int = 400) -> Budget:
+    """A budget that comes along, by its name in ``conf/budget``: LAYOUT_MATCHER, for rendered pictures ``_rendered``.
+
+    Args:
+        name: such as ``log_polar_sgbm``.
+        source_px: side of the pictures [px].
+
+    Raises:
+        SettingError: for a name that none has.
+    """
+    path = Path(conf_dir()) / "budget" / f"{name}.yaml"
+    known = sorted(p.stem for p in path.parent.glob("*.yaml"))
+    require(name in known and name != "auto", "budget", name, "one of " + ", ".join(n for n in known if n != "auto"))
+    node = _checked(OmegaConf.load(path), str(path))
+    return Budget(**{number: node[number] for number in NUMBERS}, source_px=source_px if node["source"] else None)
 
 
 def shipped(cfg: DictConfig) -> Path | None:
