@@ -345,7 +345,7 @@ def test_matches_carry_the_same_sigma_as_the_fit_assumes():
     from torchfovea.sensing.head import Eyes
 
     pose = Eyes(same, torch.zeros(3), same, torch.tensor([0.1, 0.0, 0.0]))
-    data, which = judged(found, pose, left, retina, own, torch.ones(retina.count), clues, right)
+    data, which = judged(found, pose, (left, right), retina, own, torch.ones(retina.count), clues)
     seen = observe(found, pose, (left, right), width)
     assert data.bend_px.max() > 2 and data.gap_px.max() > 0 and data.claim_px.max() == 0
     ratio = sigma_of(data, own).double() / seen.cov[which, 5].sqrt().double()

@@ -88,7 +88,7 @@ def look_at_pair(
     known = true.valid
     truth = torch.where(known, truth, torch.zeros_like(truth))
     region = _at(regions(pair.disparity, pair.left), matches.left_px * scale + true.left_px.new_tensor(views.gaze_px))
-    data, which = judged(matches, pose, left, retina, budget, truth, found.clues, right, region=region)
+    data, which = judged(matches, pose, (left, right), retina, budget, truth, found.clues, region=region)
     ray = torch.nn.functional.normalize(left.rays(matches.left_px), dim=-1)
     points = ray / torch.where(known, truth, torch.ones_like(truth))[:, None]
     step = truth_step_px(pair.disparity)

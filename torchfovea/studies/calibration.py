@@ -94,12 +94,11 @@ class Judged(NamedTuple):
 def judged(
     matches: Correspondences,
     eyes: Eyes,
-    camera: Camera,
+    camera: Camera | tuple[Camera, Camera],
     retina: Retina,
     budget: Budget,
     inverse_range: Tensor,
     clues: Clues | None = None,
-    right_camera: Camera | None = None,
     points: SigmaPoints | None = None,
     region: Tensor | None = None,
 ) -> tuple[Judged, Tensor]:
@@ -108,12 +107,11 @@ def judged(
     Args:
         matches: (N, ...).
         eyes: the cameras' poses, in any frame.
-        camera: of both eyes or the left one, in retinal pixels.
+        camera: of both eyes, or the left one's and the right one's, in retinal pixels.
         retina: of both eyes.
         budget: which the matches were made with.
         inverse_range: the truth, (N,), from the left eye [1/m]; not finite, or 0, where unknown.
         clues: (N,), where there are any.
-        right_camera: where the right eye has another.
         points: sigma points.
         region: (N,), what each looks at.
 
@@ -126,8 +124,7 @@ def judged(
     left, right = (px.detach().clone().requires_grad_() for px in (matches.left_px, matches.right_px))
     width = retina.width_px(matches.left_px)
     with torch.enable_grad():
-        cameras = camera, right_camera or camera
-        observed = observe(matches._replace(left_px=left, right_px=right), pose, cameras, width / 2, points)
+        observed = observe(matches._replace(left_px=left, right_px=right), pose, camera, width / 2, points)
         rho = observed.mean[..., 2]
         slopes = torch.autograd.grad(rho.sum(), (left, right))
     truth = inverse_range.to(rho)
@@ -135,8 +132,9 @@ def judged(
     source = 0.0 if budget.source_px is None else 2 * retina.radius_px / budget.source_px
     own = matches.right_sigma_px.square() - eye_sigma_px(budget, retina, matches.right_px, clues).square()
     none = torch.zeros_like(width)
-    ray = camera.rays(matches.left_px)
-    axis = camera.rays(torch.zeros_like(matches.left_px[:1])).expand_as(ray)
+    eye = camera[0] if isinstance(camera, tuple) else camera
+    ray = eye.rays(matches.left_px)
+    axis = eye.rays(torch.zeros_like(matches.left_px[:1])).expand_as(ray)
     # rounding leaves crumbs of the difference of squares
     claim = torch.where(own > 1e-4 * matches.right_sigma_px.square(), own, none).sqrt() / max(budget.claim, 1e-6)
     told = [none if clue is None else clue.to(width) for clue in clues or Clues(none, none)]
