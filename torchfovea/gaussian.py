@@ -68,7 +68,8 @@ def pack(matrix: Tensor) -> Tensor:
 
 def unpack(sym: Tensor) -> Tensor:
     """Packed (..., 6) as symmetric matrices (..., 3, 3)."""
-    return sym[..., torch.tensor([0, 1, 2, 1, 3, 4, 2, 4, 5], device=sym.device)].unflatten(-1, (3, 3))
+    matrix: Tensor = sym[..., torch.tensor([0, 1, 2, 1, 3, 4, 2, 4, 5], device=sym.device)].unflatten(-1, (3, 3))
+    return matrix
 
 
 def inverse3(sym: Tensor) -> Tensor:

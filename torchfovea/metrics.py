@@ -155,7 +155,8 @@ def near_target(points: Tensor, target: Tensor, radius_m: float = 0.1) -> Tensor
 
     A NaN point (a cell whose ray meets nothing) is not near.
     """
-    return torch.linalg.vector_norm(points - target[..., None, :], dim=-1) < radius_m
+    distance: Tensor = torch.linalg.vector_norm(points - target[..., None, :], dim=-1)
+    return distance < radius_m
 
 
 def local_information(cov: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
@@ -227,7 +228,7 @@ def coverage(z: Tensor, levels: Sequence[float] = (0.5, 0.9, 0.95, 0.99), valid:
     for level in levels:
         require(0 < level < 1, "level", level, "a probability between 0 and 1")
     size = _flat(z, valid).abs()
-    half = torch.special.ndtri((1 + torch.tensor(levels, dtype=torch.float64, device=z.device)) / 2)
+    half: Tensor = torch.special.ndtri((1 + torch.tensor(levels, dtype=torch.float64, device=z.device)) / 2)
     return (size[:, None] <= half).double().mean(0)
 
 

@@ -57,7 +57,8 @@ def saccade(observer: Observer, cells: Tensor, device: str = "cpu", seed: int = 
     generator = torch.Generator().manual_seed(seed)
     matches = correspond_points(points, seen, left, pose, observer.camera, observer.retina, observer.budget)
     matches = with_noise(matches, observer.retina, generator)
-    return moved_to(Saccade(observer, new_memory(observer, cells), matches, pose), device)
+    moved: Saccade = moved_to(Saccade(observer, new_memory(observer, cells), matches, pose), device)
+    return moved
 
 
 def part_of(look: Saccade, count: int) -> Saccade:

@@ -128,7 +128,8 @@ def filterpy_loop(px: np.ndarray, sigma: np.ndarray, rig: Rig, points: SigmaPoin
 
     def root(cov: np.ndarray) -> np.ndarray:
         lower = np.linalg.cholesky(cov)
-        return (lower @ _turn(np, lower[0, 0], lower[2, 2])).T
+        turned: np.ndarray = lower @ _turn(np, lower[0, 0], lower[2, 2])
+        return turned.T
 
     merwe = MerweScaledSigmaPoints(4, points.alpha, points.beta, points.kappa, sqrt_method=root)
     parts = []
@@ -180,8 +181,11 @@ def _reachable(point: np.ndarray, head: Head) -> np.ndarray:
     pan = np.degrees(np.arctan2(y, x))
     tilt = np.degrees(np.arctan2(head.eyes_up_m, reach) - np.arctan2(z, level))
     vergence = np.degrees(2 * np.arctan2(head.baseline_m / 2, np.maximum(distance, 1e-6)))
-    within = (np.abs(pan) <= head.pan_limit_deg) & (tilt <= head.tilt_down_deg) & (tilt >= -head.tilt_up_deg)
-    return within & (vergence <= head.vergence_max_deg) & (distance > 1e-3) & (level > 1e-6)
+    within: np.ndarray = (
+        (np.abs(pan) <= head.pan_limit_deg) & (tilt <= head.tilt_down_deg) & (tilt >= -head.tilt_up_deg)
+    )
+    within &= (vergence <= head.vergence_max_deg) & (distance > 1e-3) & (level > 1e-6)
+    return within
 
 
 class Choice(NamedTuple):

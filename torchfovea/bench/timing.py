@@ -125,7 +125,7 @@ def interleaved(
         device: waited for, where it is not the CPU.
         warm: whether they have been called already; else each is called once first, which does not count.
     """
-    wait = torch.cuda.synchronize if device.startswith("cuda") else lambda: None
+    wait: Callable[[], None] = torch.cuda.synchronize if device.startswith("cuda") else lambda: None
     taken: list[list[float]] = [[] for _ in runs]
     for run in () if warm else runs:
         run()

@@ -7,6 +7,7 @@ function r(x) can be a reward. Whether a cell *may* be looked at (eligibility) i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -185,7 +186,7 @@ def _checked(reward: Tensor, points: Tensor) -> Tensor:
 
 
 def _tiny(x: Tensor) -> float:
-    return torch.finfo(x.dtype).tiny ** 0.5
+    return math.sqrt(torch.finfo(x.dtype).tiny)
 
 
 def _norm(x: Tensor) -> Tensor:
@@ -212,4 +213,5 @@ def _cholesky3(cov: Tensor) -> Tensor:
     e = over(yz - b * c, d)
     f = _root(zz - c * c - e * e)
     zero = torch.zeros_like(a)
-    return columns(a, zero, zero, b, d, zero, c, e, f).unflatten(-1, (3, 3))
+    lower: Tensor = columns(a, zero, zero, b, d, zero, c, e, f).unflatten(-1, (3, 3))
+    return lower

@@ -164,7 +164,7 @@ def inverse_range_acuity(
         step = torch.tensor([1e-2, 0.0], dtype=px.dtype, device=px.device)
         other = camera.rays(px + step)
         ray, other = (r / torch.linalg.vector_norm(r, dim=-1, keepdim=True) for r in (ray, other))
-        per_px = torch.linalg.vector_norm(other - ray, dim=-1) / 1e-2
+        per_px: Tensor = torch.linalg.vector_norm(other - ray, dim=-1) / 1e-2
         return math.sqrt(2) * eye_sigma_px(budget, retina, px) * per_px / baseline_m
 
     return law

@@ -97,8 +97,7 @@ def _run(cfg: DictConfig) -> float | None:
             slopes = {g.axis: _slope(g.sizes, g.runs, seconds, device) for g in path.growths}
             floor_ms = 1e3 * path.moved / path.units / bandwidth
             over = timings[0].median_ms / floor_ms if path.moved else None
-            new = _rows(path, timings, over, slopes)
-            rows += new
+            rows += _rows(path, timings, over, slopes)
             _tabulate(table, path, timings, over, slopes)
             if path.name not in done:
                 done.add(path.name)
@@ -115,7 +114,8 @@ def _run(cfg: DictConfig) -> float | None:
     console.print(table)
     write_csv(folder / "bench.csv", _COLUMNS, rows)
     write_result(folder, figures)
-    return figures["step.ratio"]
+    ratio: float | None = figures["step.ratio"]
+    return ratio
 
 
 def _scaled(timing: Timing, factor: float) -> Timing:

@@ -125,7 +125,7 @@ def _episodes(tasks: list[Task], folder: Path, workers: int, backend: str) -> li
 
 def _read(path: Path, task: Task) -> list[Row]:
     try:
-        rows = json.loads(path.read_text(encoding="utf-8"))
+        rows: list[Row] = json.loads(path.read_text(encoding="utf-8"))
         complete = len(rows) == len(task.seeds) * max(1, len(task.alphas)) and all("gap_final" in row for row in rows)
     except (ValueError, TypeError):
         complete = False

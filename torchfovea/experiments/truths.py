@@ -131,4 +131,5 @@ def _at(values: Tensor, place: Tensor) -> Tensor:
 def _inverse_range(matches: Correspondences, left: Camera, right: Camera, baseline_m: float) -> Tensor:
     """Of places (N, 2) in both rectified cameras, along the left ray."""
     one, other = left.rays(matches.left_px), right.rays(matches.right_px)
-    return (one - other)[:, 0] / baseline_m / torch.linalg.vector_norm(one, dim=-1)
+    length: Tensor = torch.linalg.vector_norm(one, dim=-1)
+    return (one - other)[:, 0] / baseline_m / length

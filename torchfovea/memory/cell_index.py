@@ -133,7 +133,8 @@ def unit_cells(cells: Tensor) -> Tensor:
     largest = cells.abs().amax(-1, keepdim=True)
     require(bool(((largest > 0) & (largest < math.inf)).all()), "cells", "zero or not finite", "non-zero directions")
     p = cells.double() / largest
-    return p / p.norm(dim=-1, keepdim=True)
+    length: Tensor = p.norm(dim=-1, keepdim=True)
+    return p / length
 
 
 def arange(n: int, like: Tensor) -> Tensor:

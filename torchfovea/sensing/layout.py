@@ -134,7 +134,7 @@ class LogPolar:
     @property
     def base(self) -> float:
         """The growth a of the eccentricity from ring to ring."""
-        return (self.radius_px / self.rho_min_px) ** (1 / self.rings)
+        return math.pow(self.radius_px / self.rho_min_px, 1 / self.rings)
 
     @property
     def aspect(self) -> float:
@@ -234,7 +234,8 @@ def cortical(values: Tensor, retina: LogPolar) -> Tensor:
     """
     require(isinstance(retina, LogPolar), "retina", type(retina).__name__, "a LogPolar retina")
     require(values.shape[-1] == retina.count, "values.shape", tuple(values.shape), f"(..., {retina.count})")
-    return values[..., retina.fovea_count :].unflatten(-1, retina.shape)
+    rings: Tensor = values[..., retina.fovea_count :].unflatten(-1, retina.shape)
+    return rings
 
 
 def _square(px: Tensor) -> Tensor:

@@ -180,7 +180,8 @@ def _halve_along(image: Tensor, dim: int) -> Tensor:
     """Weights (1, 3, 3, 1) at every second pixel; slices are faster here than a convolution."""
     if image.shape[dim] % 2:
         image = torch.cat([image, image.narrow(dim, -1, 1)], dim)
-    even, odd = image.unflatten(dim, (-1, 2)).unbind(dim)
+    pairs: Tensor = image.unflatten(dim, (-1, 2))
+    even, odd = pairs.unbind(dim)
     count = even.shape[dim]
     out = (even + odd).mul_(3)
     out.narrow(dim, 1, count - 1).add_(odd.narrow(dim, 0, count - 1))

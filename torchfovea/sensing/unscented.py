@@ -92,7 +92,7 @@ class SigmaPoints:
     @property
     def spread(self) -> float:
         """√(L + λ), the distance of the sigma points in standard deviations (Eq. 11-12)."""
-        return self.alpha * (self.dimensions + self.kappa) ** 0.5
+        return self.alpha * math.sqrt(self.dimensions + self.kappa)
 
     @property
     def by_axis(self) -> bool:
@@ -222,7 +222,9 @@ def sigma_root(left_sigma: Tensor, right_sigma: Tensor, rotated: bool = True) ->
     """
     zero = torch.zeros_like(left_sigma)
     rows = root_rows(left_sigma, right_sigma, rotated)
-    return columns(*(zero if entry is None else entry for row in rows for entry in row)).unflatten(-1, (4, 4))
+    entries = columns(*(zero if entry is None else entry for row in rows for entry in row))
+    root: Tensor = entries.unflatten(-1, (4, 4))
+    return root
 
 
 def eye_root(left: Tensor, right: Tensor, rotated: bool) -> tuple[Tensor, Tensor]:

@@ -50,4 +50,5 @@ def load_mujoco() -> ModuleType:
         raise SettingError(
             f"mujoco = {type(error).__name__}: {error}: expected an importable MuJoCo (try MUJOCO_GL=disable)"
         ) from error
-    return mujoco
+    module: ModuleType = mujoco
+    return module

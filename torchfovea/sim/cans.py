@@ -164,8 +164,9 @@ def _reachable(params: Cans, head: Head, point: np.ndarray) -> np.ndarray:
 
 def _within_room(params: Cans, head: Head, c: _Candidates) -> np.ndarray:
     room, gap = params.room, c.radius + _GAP_M
-    inside = (c.x + gap < room.front_m) & (c.x - gap > -room.back_m) & (np.abs(c.y) + gap < room.side_m)
-    return inside & (c.low >= -head.ego_height_m) & (c.high + head.ego_height_m + _GAP_M < room.height_m)
+    inside: np.ndarray = (c.x + gap < room.front_m) & (c.x - gap > -room.back_m) & (np.abs(c.y) + gap < room.side_m)
+    inside &= (c.low >= -head.ego_height_m) & (c.high + head.ego_height_m + _GAP_M < room.height_m)
+    return inside
 
 
 def _outside_first_view(params: Cans, head: Head, c: _Candidates) -> np.ndarray:

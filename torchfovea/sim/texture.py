@@ -114,13 +114,15 @@ def _label(local: np.ndarray, size: np.ndarray, footprint: np.ndarray, base: np.
 
     def inside(distance: np.ndarray) -> np.ndarray:  # 1 well inside, 0 well outside, a step as wide as the footprint
         s = np.clip(0.5 + distance / (2 * blur), 0, 1)
-        return (s * s * (3 - 2 * s))[:, None]
+        step: np.ndarray = s * s * (3 - 2 * s)
+        return step[:, None]
 
     wave = 0.34 * np.sin(angle + 0.9 * np.sin(2 * angle))
     ribbon = np.maximum(inside(0.13 - np.abs(height - wave)), inside(0.02 - np.abs(height - wave - 0.24)))
     metal = inside(np.abs(height) - 0.9)
     albedo = base + ribbon * (_WHITE - base)
-    return albedo + metal * (_SILVER - albedo)
+    plated: np.ndarray = albedo + metal * (_SILVER - albedo)
+    return plated
 
 
 def colour(
@@ -155,7 +157,7 @@ def colour(
         power[rows] += own_power
     base = look[:, :3]
     mix = np.float32(0.65) / (1 + np.exp(-3 * coarse[3]))
-    albedo = base + mix[:, None] * (look[:, 3:6] - base)
+    albedo: np.ndarray = base + mix[:, None] * (look[:, 3:6] - base)
     rows = np.flatnonzero(paint.can[geom, 0] > 0)
     if len(rows) > 0:
         own = geom[rows]
@@ -168,4 +170,5 @@ def colour(
         facing = normal_w @ np.array([x, y, z], np.float32)
         light += np.float32(strength) * np.maximum(facing, 0)
     albedo *= (gain * light)[:, None]
-    return np.clip(albedo, 0, 1, out=albedo)
+    np.clip(albedo, 0, 1, out=albedo)
+    return albedo

@@ -204,7 +204,7 @@ def _read(eye: Eye, images: Tensor, u: Tensor, v: Tensor, width_px: Tensor) -> T
         [u * (eye.scale * across) + (eye.middle[0] * across - 1), v * (eye.scale * down) + (eye.middle[1] * down - 1)],
         -1,
     )
-    value = F.grid_sample(
+    value: Tensor = F.grid_sample(
         images[:, low : high + 1], grid.flatten(2, 3), padding_mode="border", align_corners=True
     ).unflatten(-1, u.shape[-2:])
     out = value[:, 0]

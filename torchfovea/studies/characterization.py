@@ -195,7 +195,8 @@ def solid_angle_sr(camera: Camera, retina: Retina, px: Tensor) -> Tensor:
         return ray * (ray * ray).sum(-1, keepdim=True).rsqrt()
 
     across, down = elementwise_jacobian(unit, px).unbind(-1)
-    return retina.width_px(px).square() * torch.linalg.cross(across, down).norm(dim=-1)
+    per_px: Tensor = torch.linalg.cross(across, down).norm(dim=-1)
+    return retina.width_px(px).square() * per_px
 
 
 def half_retina(camera: Camera, retina: Retina, dtype: torch.dtype = torch.float32) -> Places:

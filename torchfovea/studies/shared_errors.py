@@ -129,7 +129,7 @@ def _pixel_m(data: Judged) -> Tensor:
     """What a retinal pixel spans at the points' distance, (N,) [m]."""
     # a pinhole's: the tangent of the eccentricity is the distance from the axis over the focal length
     distance = torch.linalg.vector_norm(data.place_px, dim=-1) * data.pixel_px
-    focal = (distance / torch.tan(data.eccentricity_rad)).nanmedian()
+    focal: Tensor = (distance / torch.tan(data.eccentricity_rad)).nanmedian()
     return data.range_m / focal
 
 

@@ -216,7 +216,7 @@ def _values(problem: Problem, scenes: Scenes) -> Tensor:
     """What finding each can is worth, (B, S): its gap, for all saccades but two."""
     steps = problem.task.saccades
     first = blank(problem.task, scenes)[1][:, None]
-    reach = nearest_point(*(f for f in scenes[:5])).norm(dim=-1)
+    reach: Tensor = nearest_point(*(f for f in scenes[:5])).norm(dim=-1)
     room = (-scenes.nearest_m[:, None] - first).clamp(min=1e-6)
     lasting = 1.0 if problem.task.metric == "gap_final" else max(steps - 2, 1) / steps
     return ((-reach - first) / room).clamp(0, 1) * lasting
