@@ -20,7 +20,7 @@ from torchfovea.sensing.correspondence import Budget, Clues, doubt, inlier_share
 from torchfovea.sensing.kinship import once_a_pixel
 from torchfovea.setting import SettingError
 from torchfovea.studies.calibration import sigma_of
-from torchfovea.studies.shared_errors import Sight, lasting_share, shared_share
+from torchfovea.studies.shared_errors import KnownLook, lasting_share_of, shared_share
 
 # -------------------------------------------------------------------------------------------------------- the formulas
 
@@ -152,10 +152,10 @@ def test_what_looks_share_is_found_again(lasting):
             data = field_of_errors(0.0, seed)
             z = math.sqrt(lasting) * common + math.sqrt(1 - lasting) * rng.normal(size=900)
             data = data._replace(error=sigma_of(data, Budget()) * torch.as_tensor(z))
-            looks.append(Sight(data, points, axis))
+            looks.append(KnownLook(data, points, axis))
         scenes.append(looks)
-    assert lasting_share(scenes, Budget()) == pytest.approx(lasting, abs=0.05)
-    assert lasting_share([[look._replace(axis=axes[0]) for look in looks] for looks in scenes], Budget()) is None
+    assert lasting_share_of(scenes, Budget()) == pytest.approx(lasting, abs=0.05)
+    assert lasting_share_of([[look._replace(axis=axes[0]) for look in looks] for looks in scenes], Budget()) is None
 
 
 # ----------------------------------------------------------------------------------------------------------- the files

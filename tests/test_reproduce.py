@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from torchfovea.cli import main
 from torchfovea.config import conf_dir
 from torchfovea.experiments import cells
-from torchfovea.experiments.claims import Claim, judge, read_claims
+from torchfovea.experiments.claims import Claim, judge_claims, read_claims
 from torchfovea.setting import SettingError
 
 SMALL = (
@@ -51,7 +51,7 @@ def test_verdicts_follow_the_evidence():
         claim(id="close", minus={"arm": "c"}),
         claim(id="nothing", plus={"arm": "none"}),
     ]
-    verdicts = judge(family, rows)
+    verdicts = judge_claims(family, rows)
     assert [v.verdict for v in verdicts] == ["holds", "fails", "holds", "fails", "undecided", "undecided"]
     up = verdicts[0]
     assert up.estimate == pytest.approx(0.3, abs=0.1) and up.ci_low < up.estimate < up.ci_high and up.n == 20
@@ -71,7 +71,7 @@ def test_scenes_are_paired_and_averaged_within():
         for fov in (90, 135)
         if not (seed == 2 and fov == 135 and arm == "a")
     ]
-    verdict = judge([claim()], rows)[0]
+    verdict = judge_claims([claim()], rows)[0]
     assert verdict.n == 2 and verdict.estimate == pytest.approx(0.1)
     assert verdict.ci_low == pytest.approx(0.1) and verdict.ci_high == pytest.approx(0.1)
     assert verdict.verdict == "undecided"  # two scenes decide nothing
@@ -79,19 +79,19 @@ def test_scenes_are_paired_and_averaged_within():
 
 def test_picks_and_thresholds():
     rows = rows_of({"a": noisy(0.7), "b": noisy(0.2, seed=1), "c": noisy(0.5, seed=2)})
-    best = judge([claim(minus={"arm": ["b", "c"]}, minus_pick="highest")], rows)[0]
-    worst = judge([claim(minus={"arm": ["b", "c"]}, minus_pick="lowest")], rows)[0]
-    both = judge([claim(minus={"arm": ["b", "c"]})], rows)[0]
+    best = judge_claims([claim(minus={"arm": ["b", "c"]}, minus_pick="highest")], rows)[0]
+    worst = judge_claims([claim(minus={"arm": ["b", "c"]}, minus_pick="lowest")], rows)[0]
+    both = judge_claims([claim(minus={"arm": ["b", "c"]})], rows)[0]
     assert best.estimate == pytest.approx(0.2, abs=0.1) and worst.estimate == pytest.approx(0.5, abs=0.1)
     assert best.estimate < both.estimate < worst.estimate
-    below = judge([claim(minus=None, threshold=0.9, sign="less")], rows)[0]
+    below = judge_claims([claim(minus=None, threshold=0.9, sign="less")], rows)[0]
     assert below.verdict == "holds" and below.estimate == pytest.approx(-0.2, abs=0.1)
 
 
 def test_a_missing_local_information_is_left_out():
     rows = rows_of({"a": noisy(1.0), "b": noisy(0.5)})
     rows[0]["gap_per_saccade"] = None
-    assert judge([claim()], rows)[0].n == 19
+    assert judge_claims([claim()], rows)[0].n == 19
 
 
 @pytest.mark.parametrize(
@@ -189,7 +189,7 @@ def test_failed_cells_are_named_and_the_rest_is_kept(tmp_path, capsys):
 
 
 def test_verdicts_are_data():
-    row = asdict(judge([claim()], rows_of({"a": noisy(1.0), "b": noisy(0.0)}))[0])
+    row = asdict(judge_claims([claim()], rows_of({"a": noisy(1.0), "b": noisy(0.0)}))[0])
     assert all(value is None or isinstance(value, str | int) or math.isfinite(value) for value in row.values())
 
 

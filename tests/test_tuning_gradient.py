@@ -37,8 +37,8 @@ from torchfovea.tuning.check import Sample, agreement, estimate_gradient, finite
 from torchfovea.tuning.estimators import alpha_difference, counterfactual
 from torchfovea.tuning.pathwise import panorama
 from torchfovea.tuning.prior_field import fit_by_gradient, fit_closed_form, look_up
-from torchfovea.tuning.problem import Problem, evaluate, play, play_each, prepare
-from torchfovea.tuning.scenes import Distribution, cast, draw_scenes, stream
+from torchfovea.tuning.problem import Problem, evaluate_bias, play, play_each, prepare
+from torchfovea.tuning.scenes import Distribution, draw_scenes, first_surfaces, stream
 from torchfovea.tuning.simulator import Task, simulate
 from torchfovea.tuning.study import Heldout, budgets_up_to, curves, episodes_to_reach, student
 from torchfovea.tuning.train import ESTIMATORS, Schedule, gradient, train
@@ -361,7 +361,7 @@ def test_curves_and_hand():
     by_hand, sigma = hand(p, scenes=64, sigmas=(0.05, 0.16, 0.5))
     assert sigma == 0.16
     start = table_1(p.shape, "top")
-    better, worse = (evaluate(p, x, 64, stream("heldout", 0)) for x in (by_hand, start))
+    better, worse = (evaluate_bias(p, x, 64, stream("heldout", 0)) for x in (by_hand, start))
     assert float((better - worse).mean()) > 0.1
     schedule, heldout = Schedule(episodes=150, validation_scenes=16), Heldout(16, 1)
     whole = list(curves(p, start, ["coverage+none", "random@16"], 2, schedule, heldout))
@@ -382,8 +382,8 @@ def test_an_incumbent_is_not_credited_before_its_episodes_are_spent(monkeypatch)
     monkeypatch.setitem(SEARCHES, "random", lambda *_: iter([(65, later), (200, start)]))
     (curve,) = curves(p, start, ["random"], 1, Schedule(episodes=256, validation_scenes=64), Heldout(64, 1))
     before, after, _ = (row.heldout for row in curve)
-    assert before == float(evaluate(p, start, 64, stream("heldout", 1)).mean())
-    assert after == float(evaluate(p, later, 64, stream("heldout", 1)).mean()) > before
+    assert before == float(evaluate_bias(p, start, 64, stream("heldout", 1)).mean())
+    assert after == float(evaluate_bias(p, later, 64, stream("heldout", 1)).mean()) > before
     assert curve[2].heldout == after and curve[2].heldout_last == before
 
 
@@ -417,7 +417,7 @@ def test_the_prior_field_is_the_moments_of_what_there_is():
     scenes = draw_scenes(Distribution(cans=3), HEAD, 60, stream("training", 0))
     direction = sphere_quadrature(3000, lambda d: reachable(HEAD, d)).directions
     field = fit_closed_form(scenes, direction)
-    hits = cast(scenes, torch.zeros(60, 1, 3), direction.expand(60, -1, -1))
+    hits = first_surfaces(scenes, torch.zeros(60, 1, 3), direction.expand(60, -1, -1))
     rho = np.where(hits.floor, 1 / 6, 1 / hits.range_m.numpy())
     kernel = np.exp(150 * (direction @ direction.T - 1).numpy())
     kernel /= kernel.sum(1, keepdims=True)

@@ -15,7 +15,7 @@ from torchfovea.sensing.triangulation import observe
 from torchfovea.setting import SettingError
 from torchfovea.tuning.bias import Shape
 from torchfovea.tuning.problem import Problem
-from torchfovea.tuning.scenes import Distribution, Scenes, cast, draw_scenes, stream
+from torchfovea.tuning.scenes import Distribution, Scenes, draw_scenes, first_surfaces, stream
 from torchfovea.tuning.simulator import Known, Task, best_cell, empty, glance, look, score, simulate, world_of
 
 HEAD = Head()
@@ -89,7 +89,7 @@ def test_rays_are_those_of_a_loop():
     aimed = torch.nn.functional.normalize(aim.repeat(1, 4, 1) + jitter, dim=-1)
     direction = torch.cat((directions((6, 30)), aimed), 1)
     origin = torch.tensor([0.05, -0.02, 0.12], dtype=torch.float64).expand(6, 1, 3)
-    hits = cast(scenes, origin, direction)
+    hits = first_surfaces(scenes, origin, direction)
     cans = 0
     for b in range(6):
         for k in range(direction.shape[1]):
@@ -104,7 +104,9 @@ def test_rays_are_those_of_a_loop():
 def test_rays_are_differentiable_where_the_surface_stays():
     scenes = draw_scenes(Distribution(), HEAD, 2, stream("training", 4), torch.float64)
     direction = directions((2, 3), seed=5).requires_grad_()
-    assert torch.autograd.gradcheck(lambda d: cast(scenes, torch.zeros(2, 1, 3).double(), d).range_m, direction)
+    assert torch.autograd.gradcheck(
+        lambda d: first_surfaces(scenes, torch.zeros(2, 1, 3).double(), d).range_m, direction
+    )
 
 
 def episode_by_loop(task, scenes, b, world, alpha):

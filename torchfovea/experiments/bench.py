@@ -32,7 +32,7 @@ from torchfovea.sensing.layout import LogPolar
 from torchfovea.setting import require
 from torchfovea.sim import gl, rays
 from torchfovea.tuning.scenes import Distribution, draw_scenes
-from torchfovea.tuning.simulator import Task, World, simulate, world_of
+from torchfovea.tuning.simulator import Task, Worlds, simulate, world_of
 
 __all__ = ["run"]
 
@@ -298,7 +298,7 @@ def _tune(cfg: DictConfig, observer: Observer) -> Path:
     world = world_of(task, scenes, directions, noise)
     alpha = torch.ones(())
     part = [torch.tensor([b]) for b in range(min(8, episodes))]
-    singles: list[tuple[Any, World]] = [(scenes.take(one), world.take(one)) for one in part]
+    singles: list[tuple[Any, Worlds]] = [(scenes.take(one), world.take(one)) for one in part]
 
     def alone() -> torch.Tensor:
         return torch.cat([simulate(task, *single, alpha).value for single in singles])

@@ -29,7 +29,7 @@ from torchfovea.sim.world import World
 from torchfovea.stereo.matchers import Matcher
 from torchfovea.studies.calibration import Judged, concatenate, inlier_of, judge, select, sigma_of
 from torchfovea.studies.fitting import BudgetFit, Likelihood, fit_budget, least_match_px
-from torchfovea.studies.shared_errors import Sight, lasting_share, shared_share
+from torchfovea.studies.shared_errors import KnownLook, lasting_share_of, shared_share
 
 __all__ = ["random_gazes", "run"]
 
@@ -200,8 +200,10 @@ def _pairs(cfg: DictConfig, budget: Budget, matcher: Matcher) -> dict[str, Split
 def _sharing(budget: Budget, data: dict[str, Split]) -> Budget:
     """The budget with what errors have in common, where the looks tell."""
     shared = shared_share([look.data for split in data.values() for look in split.looks], budget)
-    sights = [[Sight(t.data, t.point_m, t.axis) for t in looks] for split in data.values() for looks in split.scenes]
-    lasting = lasting_share(sights, budget)
+    sights = [
+        [KnownLook(t.data, t.point_m, t.axis) for t in looks] for split in data.values() for looks in split.scenes
+    ]
+    lasting = lasting_share_of(sights, budget)
     if shared is not None:
         share, factor = shared
         px, widths = (factor * length for length in (budget.shared_px, budget.shared_widths))

@@ -22,7 +22,7 @@ from torchfovea.experiments.build import build_observer, whole
 from torchfovea.experiments.rollout import batched, one_episode, roll_out
 from torchfovea.setting import require
 
-__all__ = ["METRICS", "Task", "cells_of", "regret_convergence", "run_task", "task_name"]
+__all__ = ["METRICS", "CellTask", "cells_of", "regret_convergence", "run_task", "task_name"]
 
 METRICS = (
     "gap_final", "gap_per_saccade", "regret_per_saccade", "global_information_per_saccade",
@@ -32,7 +32,7 @@ METRICS = (
 CURVES = ("gap", "regret", "global_information", "local_information")
 
 
-class Task(NamedTuple):
+class CellTask(NamedTuple):
     """Episodes that one process runs; it is plain data.
 
     Attributes:
@@ -54,7 +54,7 @@ class Task(NamedTuple):
     curves: tuple[str, ...]
 
 
-def task_name(task: Task) -> str:
+def task_name(task: CellTask) -> str:
     """A file's name that only the same task has."""
     text = json.dumps(task, sort_keys=True, default=str)
     words = [str(task.labels[key]) for key in ("fig", "scene", "reading", "sensor", "fov_deg", "bias")]
@@ -73,7 +73,7 @@ def _alpha_name(alpha: float) -> str:
     return "ucb_inf" if math.isinf(alpha) else f"ucb_{alpha:g}"
 
 
-def cells_of(cfg: DictConfig) -> list[Task]:
+def cells_of(cfg: DictConfig) -> list[CellTask]:
     """All tasks of a reproduction, those that count first."""
     plain: Any = OmegaConf.to_container(cfg, resolve=True)
     require(plain["arms"] in plain["fig8"]["alphas"], "arms", plain["arms"], ", ".join(plain["fig8"]["alphas"]))
@@ -112,7 +112,7 @@ def cells_of(cfg: DictConfig) -> list[Task]:
 def _tasks(
     plain: Mapping[str, Any], labels: dict[str, Any], alphas: Sequence[float], others: Sequence[str],
     curves: tuple[str, ...], changes: Sequence[str] = (),
-) -> list[Task]:  # fmt: skip
+) -> list[CellTask]:  # fmt: skip
     scene, bias, sizes = labels["scene"], labels["bias"], plain["sensor"]
     sample = "null" if sizes["sample"] is None else sizes["sample"]
     memory = "aimed" if bias == "target" and scene != "attention_world" else bias
@@ -130,12 +130,12 @@ def _tasks(
     if alphas:
         size = max(1, plain["batch"] // len(alphas))
         tasks += [
-            Task(labels, overrides, (), tuple(float(a) for a in alphas), "ucb", tuple(part), curves)
+            CellTask(labels, overrides, (), tuple(float(a) for a in alphas), "ucb", tuple(part), curves)
             for part in _parts(seeds, size)
         ]
     for other in others:
         tasks += [
-            Task(labels, overrides, (f"acquisition={other}",), (), other, tuple(part), curves)
+            CellTask(labels, overrides, (f"acquisition={other}",), (), other, tuple(part), curves)
             for part in _parts(seeds, plain["batch"])
         ]
     return tasks
@@ -163,7 +163,7 @@ def _search(overrides: tuple[str, ...], folders: tuple[str, ...]) -> DictConfig:
         return compose("search", overrides=[*overrides, *places])
 
 
-def run_task(task: Task, folders: tuple[str, ...] = ()) -> list[dict[str, Any]]:
+def run_task(task: CellTask, folders: tuple[str, ...] = ()) -> list[dict[str, Any]]:
     """A row for each of a task's episodes: labels, arm, seed, metrics, and the course where it is kept.
 
     Args:
@@ -186,7 +186,7 @@ def run_task(task: Task, folders: tuple[str, ...] = ()) -> list[dict[str, Any]]:
     return [_row(task, _alpha_name(alpha), seed, e) for (seed, alpha), e in zip(pairs, episodes, strict=True)]
 
 
-def _row(task: Task, arm: str, seed: int, episode: Episode) -> dict[str, Any]:
+def _row(task: CellTask, arm: str, seed: int, episode: Episode) -> dict[str, Any]:
     local = episode.local_information
     values = (
         float(episode.gap[-1]), float(episode.gap.mean()), float(episode.regret.mean()),

@@ -11,7 +11,7 @@ import torch
 from torchfovea.setting import require
 from torchfovea.studies.significance import bootstrap_interval, holm, sign_flip_p_value
 
-__all__ = ["Claim", "Verdict", "judge", "read_claims", "select"]
+__all__ = ["Claim", "Verdict", "judge_claims", "read_claims", "rows_where"]
 
 Row = Mapping[str, Any]
 
@@ -116,7 +116,7 @@ def read_claims(settings: Sequence[Mapping[str, Any]]) -> list[Claim]:
     return claims
 
 
-def select(rows: Sequence[Row], chosen: Row) -> list[Row]:
+def rows_where(rows: Sequence[Row], chosen: Row) -> list[Row]:
     """The episodes of a selection."""
 
     def fits(row: Row) -> bool:
@@ -130,7 +130,7 @@ def select(rows: Sequence[Row], chosen: Row) -> list[Row]:
 
 def _by_scene(rows: Sequence[Row], metric: str, chosen: Row, pick: str | None) -> dict[int, float]:
     """Mean of a metric for each scene; only cells that every scene has, so that scenes stay comparable."""
-    found = [row for row in select(rows, chosen) if row.get(metric) is not None]
+    found = [row for row in rows_where(rows, chosen) if row.get(metric) is not None]
     arms: dict[Any, list[Row]] = {}
     for row in found:
         arms.setdefault((row.get("arm"), row.get("bias")), []).append(row)
@@ -154,7 +154,7 @@ def _differences(claim: Claim, rows: Sequence[Row]) -> torch.Tensor:
     return torch.tensor([left[s] - right[s] for s in both], dtype=torch.float64)
 
 
-def judge(claims: Sequence[Claim], rows: Sequence[Row], level: float = 0.95, seed: int = 0) -> list[Verdict]:
+def judge_claims(claims: Sequence[Claim], rows: Sequence[Row], level: float = 0.95, seed: int = 0) -> list[Verdict]:
     """Judge a family of claims on the same episodes.
 
     The scene is the unit: differences are taken within a scene, their mean is bootstrapped over scenes, and tested by

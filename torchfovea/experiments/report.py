@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from torchfovea import __version__
-from torchfovea.experiments.claims import select
+from torchfovea.experiments.claims import rows_where
 from torchfovea.files import replacing, write_csv
 from torchfovea.pictures import reproduce as pictures_reproduce
 from torchfovea.studies.significance import bootstrap_interval
@@ -39,7 +39,7 @@ def write_report(folder: Path, plain: Row, rows: list[Row], stated: list[Row], f
         fig5: the curves of `torchfovea.experiments.fig5`.
     """
     sections: list[tuple[str, list[Path], str]] = []
-    pictures_reproduce.draw_fig5(folder / "fig5.png", fig5)
+    pictures_reproduce.draw_vergences(folder / "fig5.png", fig5)
     sections.append(("Fig. 5: what a sensor knows of a plane", [folder / "fig5.png"], ""))
     sections += _fig8(folder, plain, rows) + _fig9(folder, plain, rows)
     sections += _ablation(folder, rows, plain["level"])
@@ -92,7 +92,7 @@ def _claims_table(stated: list[Row]) -> str:
 def _fig8(folder: Path, plain: Row, rows: list[Row]) -> list[tuple[str, list[Path], str]]:
     sections = []
     for condition in plain["fig8"]["conditions"]:
-        own = select(rows, {"fig": 8, **condition})
+        own = rows_where(rows, {"fig": 8, **condition})
         if not own:
             continue
         name, words = f"{condition['scene']}_{condition['reading']}", f"{condition['scene']}, {condition['reading']}"
@@ -100,7 +100,7 @@ def _fig8(folder: Path, plain: Row, rows: list[Row]) -> list[tuple[str, list[Pat
         pictures_reproduce.draw_arms(arms, own, f"Fig. 8a, {words}: mean over scenes with 95% CI")
         groups = {
             f"{sensor.replace('_', '-')}, {fov}°": (
-                colour, select(own, {"sensor": sensor, "fov_deg": fov, "arm": "ucb_100"})
+                colour, rows_where(own, {"sensor": sensor, "fov_deg": fov, "arm": "ucb_100"})
             )
             for (sensor, fov), colour in pictures_reproduce.COLOURS.items()
         }  # fmt: skip
@@ -112,15 +112,15 @@ def _fig8(folder: Path, plain: Row, rows: list[Row]) -> list[tuple[str, list[Pat
 def _fig9(folder: Path, plain: Row, rows: list[Row]) -> list[tuple[str, list[Path], str]]:
     sections = []
     for condition in plain["fig9"]["conditions"]:
-        own = select(rows, {"fig": 9, **condition})
+        own = rows_where(rows, {"fig": 9, **condition})
         for arm in dict.fromkeys(row["arm"] for row in own):
-            part = select(own, {"arm": arm})
+            part = rows_where(own, {"arm": arm})
             words = f"{condition['scene']}, {condition['reading']}, α = {arm.removeprefix('ucb_')}"
             name = f"{condition['scene']}_{condition['reading']}_{arm}"
             bars, course = folder / f"fig9a_{name}.png", folder / f"fig9b_{name}.png"
             pictures_reproduce.draw_biases(bars, part, f"Fig. 9a, {words}: mean over scenes with 95% CI")
             groups = {
-                bias: (colour, select(part, {"bias": bias}))
+                bias: (colour, rows_where(part, {"bias": bias}))
                 for bias, colour in pictures_reproduce.BIASES.items()
                 if bias != "aimed"
             }
@@ -140,14 +140,14 @@ def _difference(
 
 
 def _ablation(folder: Path, rows: list[Row], level: float) -> list[tuple[str, list[Path], str]]:
-    own = select(rows, {"fig": "ablation"})
+    own = rows_where(rows, {"fig": "ablation"})
     if not own:
         return []
-    base = select(own, {"variant": "as it is"})
+    base = rows_where(own, {"variant": "as it is"})
     columns = ("gap_per_saccade", "saccades_to_target", "found", "target_error_m", "local_information_per_saccade")
     lines, drawn, table = [], [], []
     for variant in dict.fromkeys(row["variant"] for row in own):
-        part = select(own, {"variant": variant})
+        part = rows_where(own, {"variant": variant})
         cells: list[Any] = [variant]
         for metric in columns:
             known = [row[metric] for row in part if row[metric] is not None]
@@ -173,13 +173,13 @@ def _ablation(folder: Path, rows: list[Row], level: float) -> list[tuple[str, li
 
 
 def _photometric(rows: list[Row], level: float) -> list[tuple[str, list[Path], str]]:
-    own = select(rows, {"fig": "photometric"})
+    own = rows_where(rows, {"fig": "photometric"})
     if not own:
         return []
     columns = ("gap_per_saccade", "saccades_to_target", "found", "target_error_m", "regret_per_saccade")
     lines = []
     for sensor in dict.fromkeys(row["sensor"] for row in own):
-        part = select(own, {"sensor": sensor})
+        part = rows_where(own, {"sensor": sensor})
         cells = []
         for metric in columns:
             known = torch.tensor([float(row[metric]) for row in part if row[metric] is not None], dtype=torch.float64)

@@ -15,8 +15,8 @@ from rich.table import Table
 
 from torchfovea.config import run_folder
 from torchfovea.experiments.build import whole
-from torchfovea.experiments.cells import METRICS, Task, cells_of, config_folders, run_task, task_name
-from torchfovea.experiments.claims import Claim, Verdict, judge, read_claims, select
+from torchfovea.experiments.cells import METRICS, CellTask, cells_of, config_folders, run_task, task_name
+from torchfovea.experiments.claims import Claim, Verdict, judge_claims, read_claims, rows_where
 from torchfovea.experiments.fig5 import judge_fig5
 from torchfovea.experiments.manifest import complete, finished
 from torchfovea.experiments.parallel import spread, workers_of
@@ -26,10 +26,10 @@ from torchfovea.files import write_csv, write_json
 from torchfovea.mistakes import describe
 from torchfovea.setting import SettingError
 
-__all__ = ["EPISODE_COLUMNS", "run"]
+__all__ = ["run"]
 
 LABELS = ("fig", "scene", "reading", "sensor", "fov_deg", "bias", "variant", "arm", "seed")
-EPISODE_COLUMNS = (*LABELS, *METRICS)
+_COLUMNS = (*LABELS, *METRICS)
 
 Row = dict[str, Any]
 
@@ -48,9 +48,9 @@ def run(cfg: DictConfig) -> float:
     start = time.perf_counter()
     rows = _episodes(cells_of(cfg), folder / "cells", *workers_of(cfg))
     seconds = time.perf_counter() - start
-    write_csv(folder / "episodes.csv", EPISODE_COLUMNS, [[row[c] for c in EPISODE_COLUMNS] for row in rows])
-    counting = select(rows, plain["counts"])
-    verdicts = judge(claims, counting, plain["level"], plain["seed"])
+    write_csv(folder / "episodes.csv", _COLUMNS, [[row[c] for c in _COLUMNS] for row in rows])
+    counting = rows_where(rows, plain["counts"])
+    verdicts = judge_claims(claims, counting, plain["level"], plain["seed"])
     stated = [_stated(c, v) for c, v in zip(claims, verdicts, strict=True)]
     planes, fig5 = judge_fig5(plain["fig5"], plain["sensor"]["receptive_fields"])
     stated += planes
@@ -79,14 +79,16 @@ def _elsewhere(claims: list[Claim], rows: list[Row], plain: Row) -> dict[str, di
     conditions -= {(plain["counts"]["reading"], plain["counts"]["scene"])}
     found = {}
     for reading, scene in sorted(conditions):
-        verdicts = judge(claims, select(rows, {"reading": reading, "scene": scene}), plain["level"], plain["seed"])
+        verdicts = judge_claims(
+            claims, rows_where(rows, {"reading": reading, "scene": scene}), plain["level"], plain["seed"]
+        )
         found[f"{reading}, {scene}"] = {
             claim.id: verdict.verdict for claim, verdict in zip(claims, verdicts, strict=True) if verdict.n >= 2
         }
     return found
 
 
-def _episodes(tasks: list[Task], folder: Path, workers: int, backend: str) -> list[Row]:
+def _episodes(tasks: list[CellTask], folder: Path, workers: int, backend: str) -> list[Row]:
     """All rows: of the tasks already complete in the folder, and of the others, run now.
 
     Raises:
@@ -123,7 +125,7 @@ def _episodes(tasks: list[Task], folder: Path, workers: int, backend: str) -> li
     return sorted(rows, key=lambda row: [str(row[name]) for name in order])
 
 
-def _read(path: Path, task: Task) -> list[Row]:
+def _read(path: Path, task: CellTask) -> list[Row]:
     try:
         rows: list[Row] = json.loads(path.read_text(encoding="utf-8"))
         complete = len(rows) == len(task.seeds) * max(1, len(task.alphas)) and all("gap_final" in row for row in rows)

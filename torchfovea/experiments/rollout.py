@@ -26,7 +26,7 @@ from torchfovea.sim.arenas import GeometricArenas
 from torchfovea.sim.model import Scene
 from torchfovea.sim.truth import truth_of
 
-__all__ = ["batched", "one_episode", "prepare", "roll_out", "sample_of"]
+__all__ = ["batched", "one_episode", "prepare_episode", "roll_out", "sample_of"]
 
 StrategyFor = Callable[[Sequence[Truth]], Strategy]
 
@@ -105,7 +105,7 @@ def _start(settings: str, observer: Observer, seed: int) -> tuple[Memory, Tensor
     return memory, generator.get_state()
 
 
-def prepare(cfg: DictConfig, observer: Observer, seed: int) -> tuple[Scene, Memory, Truth, torch.Generator]:
+def prepare_episode(cfg: DictConfig, observer: Observer, seed: int) -> tuple[Scene, Memory, Truth, torch.Generator]:
     """What an episode starts from; scenes and memories are kept for the next call with the same settings."""
     scene = _scene(OmegaConf.to_yaml(OmegaConf.masked_copy(cfg, ["scene", "trust"]), resolve=True), observer.head, seed)
     generator, memory = torch.Generator().manual_seed(seed), loaded_memory(cfg, observer)
@@ -133,7 +133,7 @@ def roll_out(
         strategy: from the truths to a strategy for them all; by default the configuration's.
         each: see `torchfovea.episode.run_episodes`.
     """
-    parts = [prepare(cfg, observer, seed) for seed in seeds]
+    parts = [prepare_episode(cfg, observer, seed) for seed in seeds]
     scenes, memories, truths, generators = (list(part) for part in zip(*parts, strict=True))
     device = device_of(cfg) if "device" in cfg else "cpu"
     memory = _to(stack(memories), device)

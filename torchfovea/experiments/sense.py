@@ -17,7 +17,7 @@ from torchfovea.experiments.budgets import build_budget
 from torchfovea.experiments.build import build_match, build_sensor, choice, name_of
 from torchfovea.experiments.images import write_ply
 from torchfovea.experiments.pairs import gaze_of, load_pair
-from torchfovea.experiments.sense_report import beside, figures_of, read_at_fields
+from torchfovea.experiments.sense_report import beside, match_figures, read_at_fields
 from torchfovea.experiments.unread import refuse_unread
 from torchfovea.files import replacing, write_result
 from torchfovea.gaussian import Gaussian, columns
@@ -69,7 +69,7 @@ def run(cfg: DictConfig) -> float | None:
     sensed = sense(views, retina, matches, SigmaPoints.paper() if printed else None, not printed)
     _write(folder, sensed)
     observed, points = sensed.observed, sensed.points
-    figures: dict[str, Any] = figures_of(pair, views, retina, matches.left_px, observed, points, sensed.chosen)
+    figures: dict[str, Any] = match_figures(pair, views, retina, matches.left_px, observed, points, sensed.chosen)
     # from here on nothing can lose the points
     refused: SettingError | None = None
     if pair.disparity is not None and retina is not None:

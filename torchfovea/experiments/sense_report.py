@@ -15,13 +15,13 @@ from torchfovea.sensing.triangulation import Observations
 from torchfovea.stereo.maps import match_disparity
 from torchfovea.stereo.views import Views
 
-__all__ = ["beside", "figures_of", "read_at_fields"]
+__all__ = ["beside", "match_figures", "read_at_fields"]
 
 LEVELS = (0.5, 0.9, 0.95, 0.99)
 OUTLIER = 5.0  # standard deviations
 
 
-def figures_of(
+def match_figures(
     pair: Pair,
     views: Views,
     retina: Retina | None,

@@ -29,7 +29,7 @@ from torchfovea.studies.significance import bootstrap_interval
 from torchfovea.tuning.baselines import TABLE_1, hand, table_1
 from torchfovea.tuning.bias import Shape, decode, encode, fov_of, mixture_of, reachable
 from torchfovea.tuning.prior_field import fit_by_gradient, fit_closed_form
-from torchfovea.tuning.problem import Problem, evaluate
+from torchfovea.tuning.problem import Problem, evaluate_bias
 from torchfovea.tuning.scenes import Distribution, draw_scenes, stream
 from torchfovea.tuning.simulator import Task
 from torchfovea.tuning.study import Heldout, Row
@@ -248,7 +248,9 @@ def _judge(
             field = fit(scenes_seen, grid, problem.task.far_m)
             informed = Problem(problem.task, problem.distribution, problem.shape, problem.cells, problem.dtype, field)
             tried = [table_1(problem.shape, "unbiased", a) for a in _FIELD_ALPHAS]
-            scores = [float(evaluate(informed, v, min(checked, 256), stream("validation", 0)).mean()) for v in tried]
+            scores = [
+                float(evaluate_bias(informed, v, min(checked, 256), stream("validation", 0)).mean()) for v in tried
+            ]
             policies[name] = (tried[scores.index(max(scores))], informed)
             if name == "prior_field":
                 policies["tuned_with_prior_field"] = (state.best, informed)
@@ -263,7 +265,7 @@ def _judge(
         return float(interval.estimate)
 
     for name, (vector, judged) in policies.items():
-        values[name] = evaluate(judged, vector, heldout.scenes, stream("heldout", heldout.seed))
+        values[name] = evaluate_bias(judged, vector, heldout.scenes, stream("heldout", heldout.seed))
         note(name, values[name])
     best = max(TABLE_1, key=lambda name: float(values[name].mean()))
     for other in (best, "hand", *(["prior_field"] if cfg.prior_field else [])):

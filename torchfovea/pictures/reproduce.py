@@ -18,7 +18,7 @@ matplotlib.use("Agg")
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-__all__ = ["draw_ablation", "draw_arms", "draw_biases", "draw_course", "draw_fig5"]
+__all__ = ["draw_ablation", "draw_arms", "draw_biases", "draw_course", "draw_vergences"]
 
 Rows = Sequence[Mapping[str, Any]]
 
@@ -125,7 +125,7 @@ def draw_biases(path: Path, rows: Rows, title: str) -> None:
     write_figure(path, figure, dpi=75)
 
 
-def draw_fig5(path: Path, curves: Mapping[str, Any]) -> None:
+def draw_vergences(path: Path, curves: Mapping[str, Any]) -> None:
     """Fig. 5b: information over vergence for planes at several distances; dots are the matched vergences."""
     figure = Figure(figsize=(9, 5), layout="constrained")
     axes = figure.subplots()

@@ -15,7 +15,7 @@ from torchfovea.sim.compile import compile_solids, seeded, stand_at
 from torchfovea.sim.model import EgoPose, Scene
 from torchfovea.sim.rays import cast
 from torchfovea.sim.room import POLE, TARGET, Room, Solid, can, furnish, pole
-from torchfovea.sim.truth import reachable_directions
+from torchfovea.sim.truth import reachable_grid
 
 __all__ = ["Cans", "place_cans", "target_in_sight"]
 
@@ -281,7 +281,7 @@ def target_in_sight(scene: Scene, margin_m: float) -> bool:
     for eye in (pose.t_left, pose.t_right, cyclopean(scene.head, gaze)[1]):
         if int(cast(scene, eye, (inner - eye)[None]).geom[0]) != geom:
             return False
-    direction = reachable_directions(scene.head, 0.5)
+    direction = reachable_grid(scene.head, 0.5)
     hits = cast(scene, origin, direction)
     within = fixate(scene.head, hits.range_m[:, None] * direction)[1] & ~scene.is_floor(hits.geom) & (hits.geom != geom)
     limit = torch.full_like(hits.range_m, float(near.norm()) + margin_m)

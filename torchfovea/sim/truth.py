@@ -12,7 +12,7 @@ from torchfovea.sensing.head import Head, fixate
 from torchfovea.sim.model import Nearest, Scene
 from torchfovea.sim.rays import RayHits, cast
 
-__all__ = ["find_nearest", "reachable_directions", "truth_of"]
+__all__ = ["find_nearest", "reachable_grid", "truth_of"]
 
 _STARTS = 6  # places of the coarse grid that are refined
 _HALF = 10  # a refinement looks at (2·10 + 1)² rays
@@ -35,7 +35,7 @@ def _reach(head: Head) -> tuple[float, float, float]:
     return math.radians(head.pan_limit_deg), low, math.radians(head.tilt_up_deg) + max(lift, 0.0)
 
 
-def reachable_directions(head: Head, step_deg: float) -> Tensor:
+def reachable_grid(head: Head, step_deg: float) -> Tensor:
     """A grid of unit directions from E (N, 3), float64, that covers every direction in which a point can be fixated."""
     side, low, high = _reach(head)
     step = math.radians(step_deg)
@@ -57,7 +57,7 @@ def find_nearest(scene: Scene, step_deg: float = 0.3) -> Nearest:
     A grid over all reachable directions, then shrinking grids around the best places of it, to well below a millimetre.
     An object thinner than `step_deg` may be missed.
     """
-    grid = reachable_directions(scene.head, step_deg)
+    grid = reachable_grid(scene.head, step_deg)
     far, hits = _eligible_range(scene, grid)
     best = Nearest(torch.zeros(3, dtype=torch.float64), math.inf, -1)
     order = far.argsort()

@@ -1,6 +1,6 @@
 """Costs of inverse-range hypotheses on a sheet of one eye, read from the other eye's image.
 
-Everything here is differentiable in the images, but for `spread`.
+Everything here is differentiable in the images, but for `inverse_depths`.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ __all__ = [
     "Looks",
     "acuity",
     "correlate",
+    "inverse_depths",
     "own_values",
     "project",
     "read_other",
     "read_own",
     "sheet_rays",
-    "spread",
 ]
 
 
@@ -272,7 +272,7 @@ def correlate(
 
 
 @torch.no_grad()
-def spread(eye: Eye, sheet: Sheet, low: float, high: float, per_width: float, most: int) -> Tensor:
+def inverse_depths(eye: Eye, sheet: Sheet, low: float, high: float, per_width: float, most: int) -> Tensor:
     """Hypotheses of inverse depth as dense as the two retinas can tell apart.
 
     Args:

@@ -27,7 +27,7 @@ from torchfovea.setting import require
 from torchfovea.stereo.confidence import read_clues
 from torchfovea.stereo.costs import left_eye
 from torchfovea.stereo.readings import refine_reading
-from torchfovea.stereo.rectification import Frame, image_frame
+from torchfovea.stereo.rectification import RectifiedPair, image_frame
 from torchfovea.stereo.views import Views
 
 __all__ = ["checked_range", "correspondences", "match_disparity", "read_disparity", "read_map"]
@@ -78,7 +78,7 @@ def match_disparity(
 
 def read_map(
     field: Disparity,
-    frame: Frame,
+    frame: RectifiedPair,
     budget: Budget,
     range_m: tuple[float, float],
     edge_px: float = 1.0,

@@ -16,7 +16,7 @@ from torchfovea.sensing.correspondence import Budget, Correspondences, Disparity
 from torchfovea.sensing.retina import Retina
 from torchfovea.stereo.exposure import alike
 from torchfovea.stereo.maps import checked_range, read_map
-from torchfovea.stereo.rectification import Frame, frame_to_match, image_frame
+from torchfovea.stereo.rectification import RectifiedPair, frame_to_match, image_frame
 from torchfovea.stereo.sgbm import SGBM, disparity_sgbm
 from torchfovea.stereo.views import Views
 from torchfovea.stereo.visibility import undisputed
@@ -78,7 +78,9 @@ def _search(views: Views, params: SGBM, range_m: tuple[float, float]) -> tuple[i
     return params.search(low, high)
 
 
-def _dense(shown: Tensor, search: tuple[int, int], params: SGBM, frame: Frame, near: Tensor | None) -> Disparity:
+def _dense(
+    shown: Tensor, search: tuple[int, int], params: SGBM, frame: RectifiedPair, near: Tensor | None
+) -> Disparity:
     """Match both rectified views (2, H, W); `near`, bool (H, W), says where the left eye looks."""
     left, right = (view.float().cpu().numpy() for view in shown)
     # two eyes' views have a margin that is searched, images have none

@@ -17,10 +17,10 @@ from torchfovea.sensing.retina import Retina, interpolate
 from torchfovea.setting import require
 from torchfovea.stereo.views import Views
 
-__all__ = ["Frame", "frame_to_match", "frame_to_show", "image_frame"]
+__all__ = ["RectifiedPair", "frame_to_match", "frame_to_show", "image_frame"]
 
 
-class Frame(NamedTuple):
+class RectifiedPair(NamedTuple):
     """The rectified views of two images.
 
     Attributes:
@@ -98,7 +98,7 @@ class Frame(NamedTuple):
         return near & ahead & self.views.holds(left_px, self.retina, slack_px + 0.5)
 
 
-def image_frame(views: Views, retina: Retina | None) -> Frame:
+def image_frame(views: Views, retina: Retina | None) -> RectifiedPair:
     """The images of a rectified pair themselves.
 
     Raises:
@@ -108,12 +108,12 @@ def image_frame(views: Views, retina: Retina | None) -> Frame:
     _check_single(views)
     assert isinstance(views.camera_left, Pinhole)
     height, width = views.left.shape[-2:]
-    return Frame(views, retina, views.camera_left, (height, width))
+    return RectifiedPair(views, retina, views.camera_left, (height, width))
 
 
 def frame_to_match(
     views: Views, retina: Retina | None, nearest_m: float, fov_deg: float, search: tuple[int, int]
-) -> Frame:
+) -> RectifiedPair:
     """What both eyes can see of anything between the nearest range and infinity, and the search range to its left.
 
     Args:
@@ -135,10 +135,10 @@ def frame_to_match(
     width, height = (((high - low) * focal).ceil().int() + 1).clamp(min=1).tolist()
     before, after = max(search[1], 0), max(-search[0], 0)
     camera = Pinhole(focal, before - low[0].item() * focal, -low[1].item() * focal)
-    return Frame(views, retina, camera, (height, before + width + after), limit)
+    return RectifiedPair(views, retina, camera, (height, before + width + after), limit)
 
 
-def frame_to_show(views: Views, retina: Retina | None, fov_deg: float) -> Frame:
+def frame_to_show(views: Views, retina: Retina | None, fov_deg: float) -> RectifiedPair:
     """What the left eye sees, to be shown to somebody else's matcher; arguments as of `frame_to_match`.
 
     Raises:
@@ -154,7 +154,7 @@ def frame_to_show(views: Views, retina: Retina | None, fov_deg: float) -> Frame:
     low, high = slope.amin(0), slope.amax(0)
     width, height = ((high - low) * focal).ceil().int().add(1).tolist()
     camera = Pinhole(focal, -low[0].item() * focal, -low[1].item() * focal)
-    return Frame(views, retina, camera, (height, width), limit)
+    return RectifiedPair(views, retina, camera, (height, width), limit)
 
 
 def _extent(camera: Camera, retina: Retina, rotation: Tensor, limit: float) -> tuple[Tensor, Tensor]:

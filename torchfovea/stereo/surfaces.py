@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.setting import require
-from torchfovea.stereo.costs import Eye, correlate, own_values, project, sheet_rays, spread
+from torchfovea.stereo.costs import Eye, correlate, inverse_depths, own_values, project, sheet_rays
 from torchfovea.stereo.semiglobal import aggregate
 from torchfovea.stereo.sheets import Sheet, nearest_rf, read_sheet
 from torchfovea.stereo.subpixel import Neighbourhood, smoothed, steps_per_width, subpixel
@@ -137,7 +137,9 @@ def win(eye: Eye, sheet: Sheet, params: Sweep, low: Tensor, high: Tensor) -> Win
     cell = nearest_rf(eye.retina, 1 / eye.scale, sheet.px)
     low, high = low[:, cell][:, None], high[:, cell][:, None]
     least, most = float(low.amin()), float(high.amax())
-    rho = spread(eye, sheet, least, max(most, least + 1e-6), params.per_width, params.hypotheses)[None, :, None, None]
+    rho = inverse_depths(eye, sheet, least, max(most, least + 1e-6), params.per_width, params.hypotheses)[
+        None, :, None, None
+    ]
     own, ray = own_values(eye, sheet, params.window, params.noise), sheet_rays(eye, sheet.px)
     cost = ray.new_empty(len(ray), rho.numel(), *sheet.width_px.shape)
     chunk = max(1, CHUNK // low.numel())

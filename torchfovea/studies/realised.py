@@ -25,8 +25,8 @@ from torchfovea.studies.characterization import PlaneSensor, correspond_plane, s
 from torchfovea.studies.plane import draw_plane
 
 __all__ = [
+    "PlaneSight",
     "Ring",
-    "Sight",
     "look_at_plane",
     "off_lattice_distances",
     "pool_sights",
@@ -37,7 +37,7 @@ __all__ = [
 ROBUST = 1.4826  # standard deviation over median absolute deviation, for a Gaussian
 
 
-class Sight(NamedTuple):
+class PlaneSight(NamedTuple):
     """What the left receptive fields (N,) measured of a plane.
 
     Attributes:
@@ -100,14 +100,14 @@ def off_lattice_distances(sensor: PlaneSensor, size_px: int, distance_m: float, 
     return [reach / (whole + (k + 0.5) / count) for k in range(count)]
 
 
-def pool_sights(sights: list[Sight]) -> Sight:
+def pool_sights(sights: list[PlaneSight]) -> PlaneSight:
     """Several sights as one."""
-    return Sight(*(torch.cat(parts) for parts in zip(*sights, strict=True)))
+    return PlaneSight(*(torch.cat(parts) for parts in zip(*sights, strict=True)))
 
 
 def look_at_plane(
     sensor: PlaneSensor, size_px: int, distance_m: float, vergence_rad: float, seed: int, matcher: Matcher | None = None
-) -> Sight:
+) -> PlaneSight:
     """Draw a textured plane for both eyes, match the images through the retinas, and measure every receptive field.
 
     Args:
@@ -136,7 +136,7 @@ def look_at_plane(
     ray = camera.rays(px)
     eccentricity = torch.atan2(ray[..., :2].norm(dim=-1), ray[..., 2])
     reach = points.norm(dim=-1)
-    return Sight(
+    return PlaneSight(
         rho - 1 / reach,
         sigma,
         printed,
@@ -156,7 +156,7 @@ def _inverse_range(
     return seen.mean[..., 2], seen.cov[..., 5].sqrt(), seen.valid
 
 
-def rings_of_error(sight: Sight, edges_rad: Tensor) -> list[Ring]:
+def rings_of_error(sight: PlaneSight, edges_rad: Tensor) -> list[Ring]:
     """Sum up the errors between eccentricities.
 
     Args:
@@ -190,7 +190,7 @@ def rings_of_error(sight: Sight, edges_rad: Tensor) -> list[Ring]:
     return rings
 
 
-def realised_information(sight: Sight, edges_rad: Tensor) -> dict[str, tuple[float, float]]:
+def realised_information(sight: PlaneSight, edges_rad: Tensor) -> dict[str, tuple[float, float]]:
     """Mean information about the inverse range, −log σ², over the matched receptive fields [nats].
 
     The realised σ is the predicted one times its ring's `scale`.

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchfovea.sensing.correspondence import Budget
 from torchfovea.studies.calibration import Judged, sigma_of
 
-__all__ = ["Sight", "lasting_share", "shared_share"]
+__all__ = ["KnownLook", "lasting_share_of", "shared_share"]
 
 CUT = 5.0  # larger |z| count as this, as in `torchfovea.metrics.nees_mean`
 GROSS = 3.0  # and beyond this an error tells nothing of what neighbours share: votes and inlier probabilities see to it
@@ -29,7 +29,7 @@ FACTORS = (0.2, 0.3, 0.45, 0.7, 1.0, 1.5)  # of the budget's correlation lengths
 GAZES_DEG = (5.0, 40.0)  # looks nearer to each other are one look, farther ones have little in common
 
 
-class Sight(NamedTuple):
+class KnownLook(NamedTuple):
     """One look at a scene whose truth is known.
 
     Attributes:
@@ -90,7 +90,7 @@ def shared_share(looks: Sequence[Judged], budget: Budget) -> tuple[float, float]
     return min(max(share, 0.0), 0.99), FACTORS[best]
 
 
-def lasting_share(scenes: Sequence[Sequence[Sight]], budget: Budget) -> float | None:
+def lasting_share_of(scenes: Sequence[Sequence[KnownLook]], budget: Budget) -> float | None:
     """The share of the variance that looks at one patch of surface have in common (`Budget.lasting`).
 
     Over pairs of looks 5 to 40 degrees apart, the correlation of z of the fields that see one point of a smooth

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchfovea.memory.sphere import direction_mixture
 from torchfovea.tuning.bias import Shape, encode, features, fix_vector
-from torchfovea.tuning.problem import Problem, evaluate, play_each
+from torchfovea.tuning.problem import Problem, evaluate_bias, play_each
 from torchfovea.tuning.scenes import Distribution, stream
 
 __all__ = ["SEARCHES", "TABLE_1", "hand", "table_1"]
@@ -61,7 +61,7 @@ def hand(
             if shape.conditioned
             else _plain_hand(shape, distribution, sigma, alpha)
         )
-        scored.append((float(evaluate(problem, vector, scenes, stream("validation", 0)).mean()), sigma, vector))
+        scored.append((float(evaluate_bias(problem, vector, scenes, stream("validation", 0)).mean()), sigma, vector))
     _, sigma, vector = max(scored, key=lambda item: item[0])
     return vector, sigma
 

@@ -24,8 +24,8 @@ from torch import Tensor
 
 from torchfovea.tuning.bias import Bias, log_density_each, log_normalizer_each
 from torchfovea.tuning.problem import Batch, Problem, play, prepare
-from torchfovea.tuning.scenes import Scenes, cast, nearest_point
-from torchfovea.tuning.simulator import Known, World, blank, simulate
+from torchfovea.tuning.scenes import Scenes, first_surfaces, nearest_point
+from torchfovea.tuning.simulator import Known, Worlds, blank, simulate
 
 __all__ = [
     "Credit",
@@ -89,7 +89,7 @@ def pull(problem: Problem, vector: Tensor, batch: Batch, credits: list[Credit]) 
 
 
 def alpha_difference(
-    problem: Problem, vector: Tensor, batch: Batch, world: World, share: float = 1.0
+    problem: Problem, vector: Tensor, batch: Batch, world: Worlds, share: float = 1.0
 ) -> tuple[float, float]:
     """Slope in log α by a central difference on the same cells, scenes and noise; and the episodes spent."""
     if not problem.shape.tune_alpha or share <= 0:
@@ -118,8 +118,8 @@ def fov_difference(problem: Problem, vector: Tensor, batch: Batch, share: float 
 
 
 def finish(
-    problem: Problem, vector: Tensor, batch: Batch, world: World, credits: list[Credit], value: Tensor, episodes: float,
-    runs: int, alpha_share: float,
+    problem: Problem, vector: Tensor, batch: Batch, world: Worlds, credits: list[Credit], value: Tensor,
+    episodes: float, runs: int, alpha_share: float,
 ) -> Gradient:  # fmt: skip
     """Turn credits into a gradient, and add the slope in log α."""
     gradient = pull(problem, vector, batch, credits)
@@ -136,7 +136,7 @@ class _Removals(NamedTuple):
     spent.
     """
 
-    world: World
+    world: Worlds
     value: Tensor
     credit: Credit
     slope: float
@@ -203,7 +203,7 @@ def covered(problem: Problem, vector: Tensor, batch: Batch, alpha_share: float =
     found = _removals(problem, problem.bias(vector.detach(), batch.scenes), batch, alpha_share)
     cells, value = found.world.direction, _values(problem, batch.scenes)
     # f(P) − f(P∖p_i) is not zero only for the one cell on the best can that is covered
-    on = cast(batch.scenes, torch.zeros_like(cells[:, :1]), cells).can
+    on = first_surfaces(batch.scenes, torch.zeros_like(cells[:, :1]), cells).can
     worth = torch.cat((value, torch.zeros_like(value[:, :1])), 1).gather(1, on % (value.shape[1] + 1))
     (best, second), which = worth.topk(2, 1).values.unbind(1), worth.argmax(1)
     scene = torch.arange(len(value))
@@ -252,6 +252,6 @@ def _on_cans(scenes: Scenes, columns: int = 6, rows: int = 9) -> tuple[Tensor, T
     flat = (1 - z * z).sqrt()
     direction = torch.stack((flat * a.cos(), flat * a.sin(), z), -1).flatten(1, 3)
     solid = (2 * half * (high - low) / (columns * rows))[..., None].expand(*away.shape, columns * rows).flatten(1)
-    seen = cast(scenes, torch.zeros_like(direction[:, :1]), direction).can
+    seen = first_surfaces(scenes, torch.zeros_like(direction[:, :1]), direction).can
     own = torch.arange(away.shape[1]).repeat_interleave(columns * rows)
     return direction, solid, torch.where(seen == own, seen, torch.full_like(seen, -1))

@@ -16,8 +16,8 @@ from torchfovea.sensing.head import eyes, fixate
 from torchfovea.tuning.bias import draw_cells, reachable
 from torchfovea.tuning.estimators import Gradient, alpha_difference
 from torchfovea.tuning.problem import Batch, Problem, prepare
-from torchfovea.tuning.scenes import Scenes, cast
-from torchfovea.tuning.simulator import Known, World, blank, empty, look, score, world_of
+from torchfovea.tuning.scenes import Scenes, first_surfaces
+from torchfovea.tuning.simulator import Known, Worlds, blank, empty, look, score, world_of
 
 __all__ = ["panorama", "pathwise"]
 
@@ -43,7 +43,7 @@ def panorama(scenes: Scenes, direction: Tensor, blur_deg: float = _BLUR_DEG) -> 
         u, v = (o.reshape(-1) for o in torch.meshgrid(grid, grid, indexing="ij"))
         taps = centre[..., None, :] + u[:, None] * side[..., None, :] + v[:, None] * rise[..., None, :]
         taps = torch.nn.functional.normalize(taps, dim=-1)
-        hits = cast(scenes, torch.zeros_like(direction[:, :1]), taps.flatten(1, 2))
+        hits = first_surfaces(scenes, torch.zeros_like(direction[:, :1]), taps.flatten(1, 2))
         rho = (1 / hits.range_m).reshape(taps.shape[:-1])
         floor = hits.floor.reshape(taps.shape[:-1]).to(direction.dtype)
     cosine = (taps * direction[..., None, :]).sum(-1)
@@ -79,7 +79,7 @@ def pathwise(problem: Problem, vector: Tensor, batch: Batch, alpha_share: float 
     rho, floor = panorama(batch.scenes, cells)
     inside = reachable(task.observer.head, cells.detach())
     prior = world_of(task, batch.scenes, hard, batch.noise)
-    world = World(cells, 1 / rho, batch.noise, inside, prior.prior_mean, prior.prior_precision)
+    world = Worlds(cells, 1 / rho, batch.noise, inside, prior.prior_mean, prior.prior_precision)
     reward = -(1 - floor) / rho - floor * task.far_m
     value = _soft_episode(problem, batch, world, reward, bias.alpha)
     slope = torch.autograd.grad(value.mean(), x)[0].double()
@@ -91,7 +91,7 @@ def pathwise(problem: Problem, vector: Tensor, batch: Batch, alpha_share: float 
     return Gradient(slope, float(value.detach().mean()), n + spent, n + round(spent))
 
 
-def _soft_episode(problem: Problem, batch: Batch, world: World, reward: Tensor, alpha: Tensor) -> Tensor:
+def _soft_episode(problem: Problem, batch: Batch, world: Worlds, reward: Tensor, alpha: Tensor) -> Tensor:
     """Value of an episode whose fixations are expectations, (B,)."""
     task = problem.task
     gaze, best = blank(task, batch.scenes)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.setting import require
-from torchfovea.tuning.scenes import Scenes, cast
+from torchfovea.tuning.scenes import Scenes, first_surfaces
 
 __all__ = ["PriorField", "fit_by_gradient", "fit_closed_form", "look_up"]
 
@@ -44,7 +44,7 @@ def look_up(field: PriorField, cells: Tensor) -> tuple[Tensor, Tensor]:
 def _samples(scenes: Scenes, direction: Tensor, far_m: float) -> Tensor:
     """True inverse ranges (B, G), the floor taken as far."""
     n = len(scenes.nearest_m)
-    hits = cast(scenes, direction.new_zeros(n, 1, 3), direction.expand(n, -1, 3))
+    hits = first_surfaces(scenes, direction.new_zeros(n, 1, 3), direction.expand(n, -1, 3))
     return torch.where(hits.floor, torch.full_like(hits.range_m, 1 / far_m), 1 / hits.range_m)
 
 

@@ -18,9 +18,9 @@ from torchfovea.setting import SettingError, require
 from torchfovea.tuning.bias import Bias, Shape, decode, draw_cells, fov_of, reachable
 from torchfovea.tuning.prior_field import PriorField, look_up
 from torchfovea.tuning.scenes import Distribution, Scenes, draw_scenes
-from torchfovea.tuning.simulator import Run, Task, World, check_observer, simulate, world_of
+from torchfovea.tuning.simulator import Run, Task, Worlds, check_observer, simulate, world_of
 
-__all__ = ["Batch", "Problem", "evaluate", "play", "play_each", "prepare"]
+__all__ = ["Batch", "Problem", "evaluate_bias", "play", "play_each", "prepare"]
 
 _QUADRATURE = 12000  # directions on the whole sphere
 
@@ -91,7 +91,7 @@ class Problem:
         return other
 
 
-def prepare(problem: Problem, bias: Bias, batch: Batch, strict: bool = True) -> World:
+def prepare(problem: Problem, bias: Bias, batch: Batch, strict: bool = True) -> Worlds:
     """Draw the cells of a batch and put them into its scenes; unless strict, cells out of reach do not exist."""
     n, rng = len(batch.scenes.nearest_m), torch.Generator().manual_seed(batch.seed)
     cells = draw_cells(bias, n, problem.cells, problem.task.observer.head, rng, strict)
@@ -125,7 +125,7 @@ def play_each(problem: Problem, vectors: Sequence[Tensor], batch: Batch) -> list
             alphas.append(bias.alpha.expand(n))
             inside.append(k)
     if inside:
-        together = World(*(torch.cat(parts, 1 if i == 2 else 0) for i, parts in enumerate(zip(*worlds, strict=True))))
+        together = Worlds(*(torch.cat(parts, 1 if i == 2 else 0) for i, parts in enumerate(zip(*worlds, strict=True))))
         scenes = batch.scenes.take(torch.arange(n).repeat(len(inside)))
         value = simulate(problem.task, scenes, together, torch.cat(alphas)).value
         for k, mean in zip(inside, value.reshape(-1, n).mean(1).tolist(), strict=True):
@@ -139,7 +139,7 @@ def _value(problem: Problem, vector: Tensor, batch: Batch) -> float:
     return -1.0
 
 
-def evaluate(
+def evaluate_bias(
     problem: Problem, vector: Tensor, scenes: int, generator: torch.Generator, at_once: int = 256, strict: bool = True
 ) -> Tensor:
     """The metric in fresh episodes, (scenes,), with the hard policy. See `prepare`."""

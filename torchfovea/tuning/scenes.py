@@ -17,7 +17,7 @@ from torchfovea.gaussian import columns
 from torchfovea.sensing.head import Head, fixate
 from torchfovea.setting import require
 
-__all__ = ["Distribution", "Hits", "Scenes", "cast", "draw_scenes", "nearest_point", "stream"]
+__all__ = ["Distribution", "Hits", "Scenes", "draw_scenes", "first_surfaces", "nearest_point", "stream"]
 
 Range = tuple[float, float]
 
@@ -261,7 +261,7 @@ def _misfits(d: Distribution, head: Head, can: Tensor, walls: tuple[float, ...])
     return ~fits | (touching & later).any(-1)
 
 
-def cast(scenes: Scenes, origin: Tensor, direction: Tensor) -> Hits:
+def first_surfaces(scenes: Scenes, origin: Tensor, direction: Tensor) -> Hits:
     """First surfaces on rays that start inside the room and outside the cans.
 
     Args:

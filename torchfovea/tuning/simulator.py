@@ -24,10 +24,10 @@ from torchfovea.sensing.camera import Pinhole
 from torchfovea.sensing.correspondence import eye_sigma_px
 from torchfovea.sensing.head import Eyes, Gaze, cyclopean, eyes, fixate, rig_frame
 from torchfovea.setting import require
-from torchfovea.tuning.scenes import Scenes, cast
+from torchfovea.tuning.scenes import Scenes, first_surfaces
 
 __all__ = [
-    "Known", "Run", "Task", "World", "best_cell", "blank", "check_observer", "empty", "glance", "look", "score",
+    "Known", "Run", "Task", "Worlds", "best_cell", "blank", "check_observer", "empty", "glance", "look", "score",
     "simulate", "true_reward", "world_of", "worth",
 ]  # fmt: skip
 
@@ -50,7 +50,7 @@ class Task(NamedTuple):
     metric: str = "gap_per_saccade"
 
 
-class World(NamedTuple):
+class Worlds(NamedTuple):
     """Cells in their scenes.
 
     Attributes:
@@ -69,10 +69,10 @@ class World(NamedTuple):
     prior_mean: Tensor
     prior_precision: Tensor
 
-    def take(self, index: Tensor) -> World:
+    def take(self, index: Tensor) -> Worlds:
         """The episodes of an index (K,), copied."""
         d, r, n, a, m, p = self
-        return World(d[index], r[index], n[:, index], a[index], m[index], p[index])
+        return Worlds(d[index], r[index], n[:, index], a[index], m[index], p[index])
 
 
 class Known(NamedTuple):
@@ -116,19 +116,19 @@ def check_observer(observer: Observer) -> None:
     require(observer.fusion.chart == "inverse_range", "fusion", observer.fusion.name, "inverse_range, in tuning")
 
 
-def empty(world: World) -> Known:
+def empty(world: Worlds) -> Known:
     """Nothing seen yet."""
     none = torch.zeros_like(world.allowed)
     return Known(world.prior_precision, world.prior_precision * world.prior_mean, none)
 
 
-def world_of(task: Task, scenes: Scenes, cells: Tensor, noise: Tensor) -> World:
+def world_of(task: Task, scenes: Scenes, cells: Tensor, noise: Tensor) -> Worlds:
     """Put cells (B, N, 3) into B scenes, with noise (T, B, N)."""
-    hits = cast(scenes, torch.zeros_like(cells[:, :1]), cells)
+    hits = first_surfaces(scenes, torch.zeros_like(cells[:, :1]), cells)
     prior = task.observer.prior
     mean = torch.full_like(hits.range_m, prior.mean)
     precision = torch.full_like(mean, prior.std**-2)
-    return World(cells, hits.range_m, noise, torch.ones_like(hits.floor), mean, precision)
+    return Worlds(cells, hits.range_m, noise, torch.ones_like(hits.floor), mean, precision)
 
 
 def glance(observer: Observer, pose: Eyes, point: Tensor, direction: Tensor, range_m: Tensor) -> tuple[Tensor, Tensor]:
@@ -176,7 +176,7 @@ def glance(observer: Observer, pose: Eyes, point: Tensor, direction: Tensor, ran
     return visible, (spread / range_m.square().square()).clamp(min=1e-12)
 
 
-def look(task: Task, world: World, memory: Known, pose: Eyes, t: int) -> Known:
+def look(task: Task, world: Worlds, memory: Known, pose: Eyes, t: int) -> Known:
     """Fuse one saccade's observations into the memory."""
     point = world.direction * world.range_m[..., None]
     visible, variance = glance(task.observer, pose, point, world.direction, world.range_m)
@@ -185,7 +185,7 @@ def look(task: Task, world: World, memory: Known, pose: Eyes, t: int) -> Known:
     return Known(memory.precision + weight, memory.vector + weight * measured, memory.seen | visible)
 
 
-def score(task: Task, world: World, memory: Known, alpha: Tensor) -> tuple[Tensor, Tensor]:
+def score(task: Task, world: Worlds, memory: Known, alpha: Tensor) -> tuple[Tensor, Tensor]:
     """Upper confidence bound of every cell.
 
     Args:
@@ -231,7 +231,7 @@ def true_reward(task: Task, scenes: Scenes, gaze: Gaze) -> Tensor:
     """
     rotation, origin = cyclopean(task.observer.head, gaze)
     axis = rotation[..., 2]
-    hits = cast(scenes, origin, axis)
+    hits = first_surfaces(scenes, origin, axis)
     range_m = (origin + hits.range_m[..., None] * axis).norm(dim=-1)
     return -torch.where(hits.floor, torch.full_like(range_m, task.far_m), range_m).clamp(max=task.far_m)
 
@@ -252,7 +252,7 @@ def worth(task: Task, reward: Tensor, nearest_m: Tensor) -> Tensor:
 def simulate(
     task: Task,
     scenes: Scenes,
-    world: World,
+    world: Worlds,
     alpha: Tensor,
     start: tuple[Known, Tensor, Tensor] | None = None,
     keep: bool = False,
@@ -291,7 +291,7 @@ def simulate(
         if live == 0:
             continue
         part = slice(0, live)
-        w = world if live == n else World(*(f[:, part] if i == 2 else f[part] for i, f in enumerate(world)))
+        w = world if live == n else Worlds(*(f[:, part] if i == 2 else f[part] for i, f in enumerate(world)))
         m = memory if live == n else Known(*(f[part] for f in memory))
         if keep:
             memories.append(m)

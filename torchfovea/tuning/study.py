@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchfovea.setting import SettingError, require
 from torchfovea.tuning.baselines import SEARCHES
-from torchfovea.tuning.problem import Problem, evaluate
+from torchfovea.tuning.problem import Problem, evaluate_bias
 from torchfovea.tuning.scenes import stream
 from torchfovea.tuning.train import ESTIMATORS, Schedule, train
 
@@ -104,7 +104,7 @@ def curves(
         key = (vector.numpy().tobytes(), split)
         if key not in scored:
             scenes, seed = (schedule.validation_scenes, 0) if split == "validation" else heldout
-            scored[key] = float(evaluate(problem, vector, scenes, stream(split, seed), strict=False).mean())
+            scored[key] = float(evaluate_bias(problem, vector, scenes, stream(split, seed), strict=False).mean())
         return scored[key]
 
     budgets = budgets_up_to(schedule.episodes)

@@ -18,7 +18,7 @@ from torchfovea.tuning.bias import fix_vector
 from torchfovea.tuning.estimators import Gradient, counterfactual, coverage, covered, fov_difference
 from torchfovea.tuning.myopic import myopic
 from torchfovea.tuning.pathwise import pathwise
-from torchfovea.tuning.problem import Batch, Problem, evaluate
+from torchfovea.tuning.problem import Batch, Problem, evaluate_bias
 from torchfovea.tuning.scenes import stream
 
 __all__ = ["ESTIMATORS", "Progress", "Schedule", "State", "gradient", "train"]
@@ -193,7 +193,7 @@ def _step(problem: Problem, schedule: Schedule, state: State) -> tuple[State, fl
 
 
 def _validate(problem: Problem, schedule: Schedule, state: State) -> None:
-    value = float(evaluate(problem, state.vector, schedule.validation_scenes, stream("validation", 0)).mean())
+    value = float(evaluate_bias(problem, state.vector, schedule.validation_scenes, stream("validation", 0)).mean())
     state.history.append((state.episodes, value, state.vector.tolist()))
     if value > state.best_value:
         state.best, state.best_value = state.vector.clone(), value
