@@ -106,3 +106,10 @@ def test_a_profile_that_is_gone_is_named(capsys, monkeypatch):
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
     assert main(["search", "profile=full"]) == 1
     assert "profile = full: expected one of paper, quick, reduced" in capsys.readouterr().err
+
+
+def test_a_setting_that_is_gone_names_what_does_its_work(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["search", "fusion.erode=0.5"]) != 0
+    error = capsys.readouterr().err
+    assert "fusion.erode = 0.5: expected fusion.window" in error and len(error.splitlines()) == 1

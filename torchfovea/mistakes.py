@@ -46,6 +46,13 @@ EXTRAS = {
     "optuna": "tune",
 }
 
+# settings that are gone, and what does their work
+RENAMED = {
+    "fusion.erode": "fusion.window, for how many looks the votes for and against a surface remember",
+    "matcher.left_right_widths": "matcher.left_right, true or false",
+    "fit.inflation": "fit.outlier_share, for outliers fall anywhere on their line",
+}
+
 
 def closest(name: str, names: Iterable[str]) -> str:
     """A hint at the nearest of ``names``, or an empty string where none is near."""
@@ -171,6 +178,8 @@ def _composition(error: HydraException, overrides: Sequence[str], known: Iterabl
         # Hydra's message names the whole override's key; OmegaConf's may name only the part that is missing.
         quoted = re.search(r"'([^']+)'", str(error))
         name = quoted[1] if quoted else str(cause.full_key)
+        if name in RENAMED:
+            return f"{_given(name, overrides)}: expected {RENAMED[name]}"
         return f"{_given(name, overrides)}: expected a known setting{closest(name, known)}"
     if isinstance(cause, OmegaConfBaseException):
         return _configuration(cause, overrides) or _first_line(error)
