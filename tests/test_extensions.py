@@ -21,7 +21,8 @@ PARTS = {
 }
 TINY = [
     "episodes=1", "saccades=3", "sensor.receptive_fields=1500", "sensor.source_px=150", "memory.cells=300",
-    "picture=false", "budget=ours"]  # fmt: skip
+    "picture=false", "budget=ours",
+]  # fmt: skip
 
 
 def written(title: str, folder: Path) -> list[str]:
