@@ -200,9 +200,9 @@ def _in_view(observer: Observer, memory: Memory, eyes: Eyes) -> Tensor:
     return inside
 
 
-def _rewards(observer: Observer, memory: Memory) -> tuple[Gaussian, RewardBelief, RewardBelief]:
+def _rewards(observer: Observer, memory: Memory, moments: Gaussian) -> tuple[Gaussian, RewardBelief, RewardBelief]:
     """Points of the surfaces, their reward, and that of an unseen one: a number, or one for each cell."""
-    moments, prior, cartesian = belief(memory), memory.prior, memory.chart == "cartesian"
+    prior, cartesian = memory.prior, memory.chart == "cartesian"
     points = moments if cartesian else cartesian_from_patches(moments, memory)
     if not isinstance(observer.reward, str):
         # the prior's range is uncertain along the ray; in x, y, z it is so in every direction
@@ -235,14 +235,15 @@ def reward_of(observer: Observer, memory: Memory) -> tuple[Gaussian, RewardBelie
     leave less and less. Unseen cells that no look has reached share the prior's reward exactly: ties are ties. What no
     look can change is not worth exploring, see `torchfovea.memory.egosphere.reducible`.
     """
-    points, reward, unseen = _rewards(observer, memory)
+    moments = belief(memory)
+    points, reward, unseen = _rewards(observer, memory, moments)
     sure, fruitless = trust(memory), memory.votes[..., 1]
     mean, std = (then.to(reward.mean) for then in unseen)
     std = std * (1 + fruitless).rsqrt()
     mean = torch.where(sure > 0, sure * reward.mean + (1 - sure) * mean, mean)
     whole, open_to_looks = (
         torch.where(sure > 0, sure * known + (1 - sure) * std, std)
-        for known in (reward.std, reward.std * reducible(memory).sqrt())
+        for known in (reward.std, reward.std * reducible(memory, moments.cov[..., 5]).sqrt())
     )
     return points, RewardBelief(mean, whole), open_to_looks
 

@@ -238,15 +238,22 @@ def belief(memory: Memory) -> Gaussian:
     return Gaussian(mean, columns(*rest, variance + variance.square() * (once.square() - twice).clamp(min=0)))
 
 
-def reducible(memory: Memory) -> Tensor:
-    """The share of the variance of `belief`'s inverse range that further looks may take away, (..., Nx).
+def reducible(memory: Memory, variance: Tensor) -> Tensor:
+    """The share of a variance of inverse range that further looks may take away, (..., Nx).
 
-    What lasts between looks is not worth another one. Differentiable.
+    What lasts between looks is not worth another one.
+
+    Args:
+        memory: of patches, or of points, of which nothing lasts.
+        variance: of `belief` (..., Nx).
+
+    Differentiable.
     """
-    variance = gaussian_from_information(memory.information).cov[..., 5]
     once, twice = memory.lasting.unbind(-1)
-    lasts = variance * (once.square() - twice).clamp(min=0)
-    return ((1 - variance * twice).clamp(min=0) / (1 + lasts)).clamp(max=1)
+    together = (once.square() - twice).clamp(min=0)
+    # of V + V² (a² − q), which is known, the V that looks average
+    own = 2 * variance / (1 + (1 + 4 * together * variance).sqrt())
+    return ((1 - own * twice).clamp(min=0) / (1 + own * together)).clamp(max=1)
 
 
 def trust(memory: Memory) -> Tensor:
