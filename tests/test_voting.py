@@ -9,9 +9,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchfovea.gaussian import columns
+from torchfovea.gaussian import Gaussian, columns, information_from_gaussian
 from torchfovea.memory.egosphere import Fusion, Prior, belief, empty_memory, reducible, trust
 from torchfovea.memory.pooling import pool_patches, share_errors
+from torchfovea.memory.sphere import fibonacci_directions
 from torchfovea.memory.update import fuse, remember
 from torchfovea.memory.voting import Sight, against, cast
 from torchfovea.sensing.correspondence import Budget, Clues, Correspondences
@@ -105,7 +106,10 @@ def test_votes_are_counted_as_in_a_loop(seed):
     patches = (columns(zero, zero, truth), columns(small + 1, zero, zero, small + 1, zero, small))
     seen, votes = rand(cells) < 0.7, 3 * columns(rand(cells), rand(cells))
     given = (seen, votes, (0.4, 0.4, 1.5), (4.0, 5.0, 0.3))
-    ballot, loop = cast(sight, patches, *given), counted(sight, patches, *given)
+    memory = empty_memory(fibonacci_directions(cells), PRIOR)
+    known = information_from_gaussian(Gaussian(*patches))
+    memory = memory._replace(information=known, looks=seen.to(votes), votes=votes)
+    ballot, loop = cast(sight, memory, FUSION), counted(sight, patches, *given)
     torch.testing.assert_close(ballot.keep, loop[0])
     assert torch.equal(ballot.anew, loop[1])
     torch.testing.assert_close(ballot.votes, loop[2])

@@ -56,8 +56,8 @@ def load_budget(name: str, source_px: int = 400) -> Budget:
         SettingError: for a name that none has.
     """
     path = Path(conf_dir()) / "budget" / f"{name}.yaml"
-    known = sorted(p.stem for p in path.parent.glob("*.yaml"))
-    require(name in known and name != "auto", "budget", name, "one of " + ", ".join(n for n in known if n != "auto"))
+    known = sorted(p.stem for p in path.parent.glob("*.yaml") if p.stem != "auto")
+    require(name in known, "budget", name, "one of " + ", ".join(known))
     node = _checked(OmegaConf.load(path), str(path))
     return Budget(**{number: node[number] for number in NUMBERS}, source_px=source_px if node["source"] else None)
 

@@ -20,8 +20,6 @@ from torchfovea.perception import Observer, new_memory, perceive
 from torchfovea.sensing.head import Gaze, eyes
 from torchfovea.setting import require
 from torchfovea.sim.arena import SimulatedArena
-from torchfovea.stereo.rig import verged
-from torchfovea.stereo.views import verged_views
 from torchfovea.studies.significance import bootstrap_interval
 
 __all__ = ["study_honesty"]
@@ -126,9 +124,7 @@ def _look(seeing: dict[str, Sensor], gaze: Gaze, generator: torch.Generator) -> 
             if pictures is None:
                 pictures = [frame.image for frame in arena.world.images(gaze)]
             left, right = pictures
-            rig, retina = verged(gaze.vergence, observer.head.baseline_m), observer.retina
-            views = verged_views(left, right, rig, observer.camera, retina.radius_px)
-            matches, _ = arena.matcher(views, retina, observer.budget)
+            matches = arena.match(left, right, gaze, generator).matches
         pose = eyes(observer.head, gaze)
         for n, memory in memories.items():
             seeing[name].memories[n] = perceive(observer, memory, matches, pose)

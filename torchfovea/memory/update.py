@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchfovea.gaussian import Gaussian, Information, columns
 from torchfovea.memory.association import Pairs, associate, gather_columns
-from torchfovea.memory.egosphere import Fusion, Memory, Prior, belief, blend, check_chart, forget
+from torchfovea.memory.egosphere import Fusion, Memory, Prior, blend, check_chart, forget
 from torchfovea.memory.pooling import Pooled, add_common, found_points, nearness, pool, pool_patches, share_errors
 from torchfovea.memory.voting import cast, see
 from torchfovea.sensing.chart import turn_cartesian
@@ -116,14 +116,7 @@ def _remember_patches(
     """Inverse ranges about patches, of which a cell believes the one that most looks speak for."""
     cells, prior = memory.cells, memory.prior
     sight = see(observed, pairs, cells, prior.slope_std)
-    ballot = cast(
-        sight,
-        belief(memory),
-        memory.looks > 0,
-        memory.votes,
-        (prior.mean, prior.std, prior.slope_std),
-        (fusion.conflict, fusion.window, fusion.nearest_m),
-    )
+    ballot = cast(sight, memory, fusion)
     memory = blend(memory, (~ballot.anew).to(cells.dtype))._replace(votes=ballot.votes)
     pooled = pool_patches(
         sight.rho, sight.variance, sight.bearing, sight.row, ballot.keep, sight.cell, cells.shape[:-1]

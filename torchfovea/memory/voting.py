@@ -21,6 +21,7 @@ from torch import Tensor
 
 from torchfovea.gaussian import columns, quadratic3
 from torchfovea.memory.association import Pairs, gather_columns, in_front
+from torchfovea.memory.egosphere import Fusion, Memory, belief
 from torchfovea.sensing.chart import basis
 from torchfovea.sensing.triangulation import Observations
 
@@ -84,49 +85,38 @@ def see(observed: Observations, pairs: Pairs, cells: Tensor, slope_std: float) -
     target, direction = gather_columns(cells, pairs.cell), gather_columns(observed.direction, which)
     row = columns(*((direction * axis).sum(-1) for axis in (*basis(target), target)))
     rho = observed.mean[..., 2].reshape(-1).index_select(0, which)
-    sure = observed.inlier is None
-    inlier = torch.ones_like(rho) if sure else observed.inlier.reshape(-1).index_select(0, which)  # type: ignore[union-attr]
+    inlier = torch.ones_like(rho) if observed.inlier is None else observed.inlier.reshape(-1).index_select(0, which)
     return Sight(rho, rr + slope_std**2 * across, 2 / across, row, inlier, pairs.cell)
 
 
-def cast(
-    sight: Sight,
-    patches: tuple[Tensor, Tensor],
-    seen: Tensor,
-    votes: Tensor,
-    first: tuple[float, float, float],
-    limits: tuple[float, float, float],
-) -> Ballot:
+def cast(sight: Sight, memory: Memory, fusion: Fusion) -> Ballot:
     """Count one look's votes.
 
     Args:
         sight: of the look.
-        patches: means (..., Nx, 3) and packed covariances (..., Nx, 6) of what cells believe.
-        seen: which cells have a surface, bool (..., Nx).
-        votes: for and against it (..., Nx, 2).
-        first: mean and standard deviation of the prior's inverse range, and how steep patches may be.
-        limits: how many standard deviations apart two surfaces are two; how many looks the votes remember; the nearest
-            range that a false match shows [m].
+        memory: of patches, before it.
+        fusion: how many standard deviations apart two surfaces are two, and what votes go by.
 
     Differentiable in the inlier probabilities; which observations agree is held fixed.
     """
-    mean, std, slope_std = first
-    conflict, window, nearest_m = limits
+    prior, patches, seen = memory.prior, belief(memory), memory.looks > 0
+    mean, std, slope_std = prior.mean, prior.std, prior.slope_std
+    conflict = fusion.conflict
     shape, count = seen.shape, seen.numel()
     has, at = seen.reshape(-1), sight.cell
     with torch.no_grad():
         told = has.index_select(0, at)
         off = sight.row[..., 0].square() + sight.row[..., 1].square()
         spread = (sight.variance + slope_std**2 * off).sqrt()
-        held = gather_columns(patches[0], at)
+        held = gather_columns(patches.mean, at)
         expected = (sight.row * held).sum(-1)
-        variance = sight.variance + quadratic3(gather_columns(patches[1], at), sight.row)
+        variance = sight.variance + quadratic3(gather_columns(patches.cov, at), sight.row)
         agrees = told & ((sight.rho - expected).square() < conflict**2 * variance)
         # of what does not agree, the nearest surface hides the rest from E, if it is one
         rest = ~agrees
         ahead = rest & in_front(sight.rho, spread, at, count, conflict, rest & (sight.inlier > 0.5))
         # how much more often true surfaces lie there than false matches, which are even in inverse range
-        usual = math.log(std * math.sqrt(2 * math.pi) * nearest_m) + ((sight.rho - mean) / std).square() / 2
+        usual = math.log(std * math.sqrt(2 * math.pi) * fusion.nearest_m) + ((sight.rho - mean) / std).square() / 2
         odds = torch.exp(-usual.clamp(min=0))
     inlier = sight.inlier
     believed = torch.where(agrees, inlier, inlier * odds / (inlier * odds + 1 - inlier).clamp(min=1e-12))
@@ -137,8 +127,9 @@ def cast(
     hits = agree + other
     share = 1 / hits.clamp(min=1)
     pro, contra = (pro * share).clamp(max=1), (contra * share).clamp(max=1)
-    yes, no = (part.reshape(-1) for part in votes.unbind(-1))
-    reached, fresh = hits > 0, ~has & (hits > 0)
+    yes, no = (part.reshape(-1) for part in memory.votes.unbind(-1))
+    reached = hits > 0
+    fresh = ~has & reached
     # where nothing agrees the doubt about the look is no vote against the cell
     more_no = no + torch.where(agree > 0, 1 - pro, contra) * reached
     more_yes = yes + pro
@@ -146,7 +137,7 @@ def cast(
     anew = fresh | turned
     kept = torch.where(turned, yes, 0.0)
     more_yes, more_no = torch.where(anew, contra, more_yes), torch.where(anew, kept + 1 - contra, more_no)
-    scale = (window / (more_yes + more_no).clamp(min=window)).detach()
+    scale = (fusion.window / (more_yes + more_no).clamp(min=fusion.window)).detach()
     new = anew.index_select(0, at)
     keep = inlier * torch.where(new, instead, for_it)
     after = columns(more_yes * scale, more_no * scale).reshape(*shape, 2)

@@ -85,13 +85,7 @@ class SimulatedArena:
         believed, gaze = gaze, self._true(gaze)
         if self.matcher is not None:
             left, right = self.world.images(gaze)
-            rig = verged(believed.vergence, observer.head.baseline_m)
-            views = verged_views(left.image, right.image, rig, observer.camera, observer.retina.radius_px)
-            matches, found = checked_matches(self.matcher(views, observer.retina, observer.budget), observer.retina)
-            chosen = draw_fields(observer.retina.count, self.sample, generator)
-            if chosen is not None:
-                matches = for_all(matches.take(chosen), observer.retina)
-            return Look(matches, Pictures(left.image, right.image, found))
+            return self.match(left.image, right.image, believed, generator)
         left_px = observer.retina.centers_px(dtype=gaze.pan.dtype)
         chosen = draw_fields(observer.retina.count, self.sample, generator)
         if chosen is not None:
@@ -104,6 +98,17 @@ class SimulatedArena:
         )
         matches = with_noise(matches, observer.retina, generator)
         return Look(matches if chosen is None else for_all(matches, observer.retina))
+
+    def match(self, left: Tensor, right: Tensor, gaze: Gaze, generator: torch.Generator) -> Look:
+        """What the matcher makes of both eyes' pictures (3, H, W), the head being believed to be at a gaze."""
+        assert self.matcher is not None
+        head, camera, retina = self.observer.head, self.observer.camera, self.observer.retina
+        views = verged_views(left, right, verged(gaze.vergence, head.baseline_m), camera, retina.radius_px)
+        matches, found = checked_matches(self.matcher(views, retina, self.observer.budget), retina)
+        chosen = draw_fields(retina.count, self.sample, generator)
+        if chosen is not None:
+            matches = for_all(matches.take(chosen), retina)
+        return Look(matches, Pictures(left, right, found))
 
     def truth(self, cells: Tensor) -> Truth:
         """What the judge knows: the nearest point, and the surface behind every memory cell (Nx, 3)."""
