@@ -19,6 +19,7 @@ from torchfovea.memory.egosphere import (
     cartesian_belief,
     empty_memory,
     forget,
+    inverse_range_belief,
     prior_information,
 )
 from torchfovea.memory.nearest import build_index
@@ -116,6 +117,18 @@ def test_nearness_is_the_marginal_of_the_whole_patch(seed):
     cov = inverse3(found.cov)
     torch.testing.assert_close(variance, cov[:, 5])
     torch.testing.assert_close(mean, (unpack(cov) @ found.mean[..., None])[:, 2, 0])
+
+
+@given(seed=st.integers(0, 1000))
+def test_the_belief_in_inverse_range_is_that_of_the_whole_patch(seed):
+    found = gaussians(5, seed)
+    memory = empty_memory(AHEAD.expand(5, 3).contiguous(), Prior())
+    lasting = torch.rand(5, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    memory = memory._replace(information=type(memory.information)(found.mean, found.cov), lasting=lasting)
+    rho, variance = inverse_range_belief(memory)
+    whole = belief(memory)
+    torch.testing.assert_close(rho, whole.mean[:, 2])
+    torch.testing.assert_close(variance, whole.cov[:, 5])
 
 
 def test_order_does_not_matter_and_unseen_cells_stay():

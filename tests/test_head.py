@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from torchfovea.sensing.head import Gaze, Head, clamp_gaze, cyclopean, eyes, fixate, to_ego
+from torchfovea.sensing.head import Gaze, Head, can_fixate, clamp_gaze, cyclopean, eyes, fixate, to_ego
 from torchfovea.setting import SettingError
 
 VIZZY, HUMAN = Head(), Head(baseline_m=0.065, eyes_forward_m=0.08, eyes_up_m=0.06, tilt_down_deg=60, tilt_up_deg=50)
@@ -69,6 +69,31 @@ def test_unreachable_is_an_answer():
     sum(a.sum() for a in gaze).backward()
     assert bool((points.grad[:9] == 0).all()) and bool(torch.isfinite(points.grad).all())
     assert points.grad[9].tolist() == pytest.approx([-0.3529, 1, -1], abs=1e-4)
+
+
+def test_what_can_be_fixated_is_what_the_angles_say(dtype):
+    """Limits of every kind, beyond a right angle too, against angles by trigonometry of its own."""
+    generator = torch.Generator().manual_seed(3)
+    points = 2 * torch.randn(4000, 3, generator=generator, dtype=torch.float64)
+    for head in (VIZZY, Head(pan_limit_deg=150.0, tilt_up_deg=80.0, tilt_down_deg=5.0, eyes_up_m=0.4)):
+        x, y, z = points.unbind(-1)
+        reach = (points.square().sum(-1) - head.eyes_up_m**2).clamp(min=0).sqrt()
+        distance = reach - head.eyes_forward_m
+        pan = torch.rad2deg(torch.angle(torch.complex(x, y))).abs()
+        tilt = torch.rad2deg(torch.asin(head.eyes_up_m / points.norm(dim=-1)) - torch.asin(z / points.norm(dim=-1)))
+        vergence = torch.rad2deg(2 * torch.atan(head.baseline_m / 2 / distance.clamp(min=1e-9)))
+        slack = torch.stack(
+            [
+                head.pan_limit_deg - pan,
+                head.tilt_up_deg + tilt,
+                head.tilt_down_deg - tilt,
+                head.vergence_max_deg - vergence,
+            ]
+        ).amin(0)
+        sure = (slack.abs() > 1e-3) & ((reach - head.eyes_forward_m).abs() > 1e-2)
+        got = can_fixate(head, points.to(dtype))
+        assert torch.equal(got[sure], ((slack > 0) & (distance > 0))[sure]) and 200 < int(got.sum()) < 3500
+        assert torch.equal(got, fixate(head, points.to(dtype))[1])
 
 
 def test_far_points_have_their_angles(dtype):

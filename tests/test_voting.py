@@ -10,12 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchfovea.gaussian import Gaussian, columns, information_from_gaussian
-from torchfovea.memory.egosphere import Fusion, Prior, belief, empty_memory, reducible, trust
+from torchfovea.memory.egosphere import Fusion, Prior, belief, cartesian_belief, empty_memory, reducible, trust
 from torchfovea.memory.pooling import pool_patches, share_errors
 from torchfovea.memory.sphere import fibonacci_directions
 from torchfovea.memory.update import fuse, remember
-from torchfovea.memory.voting import Sight, against, cast
+from torchfovea.memory.voting import Sight, against, cast, within_sight
+from torchfovea.sensing.camera import Pinhole
 from torchfovea.sensing.correspondence import Budget, Clues, Correspondences
+from torchfovea.sensing.head import Eyes, Gaze, Head, eyes
 from torchfovea.sensing.kinship import Kinship, kinship, lasting_share
 from torchfovea.sensing.layout import LogPolar
 from torchfovea.sensing.triangulation import Observations
@@ -260,3 +262,33 @@ def test_what_lasts_is_not_worth_another_look():
     assert open_to_looks(first) * belief(first).cov[0, 5].item() == pytest.approx(
         belief(first).cov[0, 5].item() - 0.3 * variance / 2, rel=1e-3
     )
+
+
+def test_what_a_look_should_have_shown_lies_on_both_retinas():
+    """Of two memories at once, cell by cell against the pinhole's own formula; and only cells that are asked."""
+    cells = fibonacci_directions(400).expand(2, 400, 3)
+    memory = empty_memory(cells, Prior())
+    generator = torch.Generator().manual_seed(0)
+    drawn = torch.rand(2, 400, generator=generator, dtype=torch.float64)
+    vector = columns(0 * drawn, 0 * drawn, (3 * drawn - 0.5) * memory.information.matrix[..., 5])
+    memory = memory._replace(information=type(memory.information)(vector, memory.information.matrix))
+    camera, retina = Pinhole.from_fov(60.0, 100.0), LogPolar(400)
+    pose = eyes(Head(), Gaze(*torch.tensor([[0.4, -0.3], [0.1, 0.3], [0.2, 0.0]], dtype=torch.float64)))
+    among = torch.rand(2, 400, generator=generator) < 0.7
+    got = within_sight(memory, among, pose, camera, retina)
+    points = cartesian_belief(memory).mean
+    for b in range(2):
+        one = within_sight(empty_of(memory, b), among[b], Eyes(*(part[b] for part in pose)), camera, retina)
+        assert torch.equal(one, got[b]) and 5 < int(one.sum()) < 200
+        for c in range(400):
+            seen = bool(among[b, c])
+            for rotation, origin in ((pose.R_left, pose.t_left), (pose.R_right, pose.t_right)):
+                x, y, z = (rotation[b].T @ (points[b, c] - origin[b])).tolist()
+                seen = seen and z > 0 and camera.focal_px * math.hypot(x, y) <= retina.radius_px * z
+            assert seen == bool(got[b, c])
+
+
+def empty_of(memory, b: int):
+    """One memory of two that are alike but for their information."""
+    one = empty_memory(memory.cells[b].contiguous(), memory.prior)
+    return one._replace(information=type(one.information)(*(part[b] for part in memory.information)))

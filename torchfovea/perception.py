@@ -26,19 +26,19 @@ from torchfovea.memory.egosphere import (
     Memory,
     Prior,
     belief,
-    cartesian_belief,
     cartesian_from_patches,
     check_chart,
     empty_memory,
+    inverse_range_belief,
     reducible,
     trust,
 )
 from torchfovea.memory.encoders import encoder_covariance
 from torchfovea.memory.update import Common, remember
-from torchfovea.memory.voting import against
+from torchfovea.memory.voting import against, within_sight
 from torchfovea.sensing.camera import Camera, Pinhole
 from torchfovea.sensing.correspondence import Budget, Correspondences
-from torchfovea.sensing.head import Eyes, Gaze, Head, cyclopean, fixate, to_ego
+from torchfovea.sensing.head import Eyes, Gaze, Head, can_fixate, cyclopean, fixate
 from torchfovea.sensing.kinship import kinship
 from torchfovea.sensing.layout import LogPolar, Retina
 from torchfovea.sensing.triangulation import observe
@@ -184,26 +184,23 @@ def perceive(
         kin = kin._replace(lasting=kin.lasting + (kin.shared - kin.lasting).clamp(min=0) * same)
     after = remember(memory, observed, observer.fusion, common, kin)
     if observer.fusion.votes:
-        missed = (after.looks == memory.looks) & _in_view(observer, memory, eyes)
+        missed = within_sight(memory, after.looks == memory.looks, eyes, observer.camera, observer.retina)
         after = after._replace(votes=against(after.votes, missed))
     return after._replace(axis=axis)
 
 
-def _in_view(observer: Observer, memory: Memory, eyes: Eyes) -> Tensor:
-    """Which cells' points fall on both retinas, bool (..., Nx)."""
-    with torch.no_grad():
-        points = cartesian_belief(memory).mean
-        inside = torch.ones_like(memory.looks, dtype=torch.bool)
-        for rotation, origin in ((eyes.R_left, eyes.t_left), (eyes.R_right, eyes.t_right)):
-            direction = to_ego(rotation.mT, points - origin.unsqueeze(-2))
-            inside &= observer.camera.in_view(direction) & observer.retina.inside(observer.camera.project(direction))
-    return inside
+def _rewards(observer: Observer, memory: Memory) -> tuple[Gaussian, RewardBelief, RewardBelief, Tensor]:
+    """Points of the surfaces, their reward, that of an unseen one (a number, or one for each cell), and a variance.
 
-
-def _rewards(observer: Observer, memory: Memory, moments: Gaussian) -> tuple[Gaussian, RewardBelief, RewardBelief]:
-    """Points of the surfaces, their reward, and that of an unseen one: a number, or one for each cell."""
+    The variance is what `torchfovea.memory.egosphere.reducible` asks for.
+    """
     prior, cartesian = memory.prior, memory.chart == "cartesian"
-    points = moments if cartesian else cartesian_from_patches(moments, memory)
+    if cartesian:
+        points = belief(memory)
+        rho, variance = None, points.cov[..., 5]
+    else:
+        rho, variance = inverse_range_belief(memory)
+        points = cartesian_from_patches(rho, variance, memory)
     if not isinstance(observer.reward, str):
         # the prior's range is uncertain along the ray; in x, y, z it is so in every direction
         sigma = prior.std if cartesian else prior.std / prior.mean**2
@@ -211,19 +208,19 @@ def _rewards(observer: Observer, memory: Memory, moments: Gaussian) -> tuple[Gau
         zero, one = torch.zeros_like(x), torch.ones_like(x)
         shape = (one, zero, zero, one, zero, one) if cartesian else (x * x, x * y, x * z, y * y, y * z, z * z)
         unseen = Gaussian(_unseen_points(memory), columns(*(sigma**2 * part for part in shape)))
-        return points, user_reward(observer.reward, points), user_reward(observer.reward, unseen)
+        return points, user_reward(observer.reward, points), user_reward(observer.reward, unseen), variance
     like = points.mean.dtype
-    if cartesian:
+    if rho is None:
         reward = range_reward(points)
         then = RewardBelief(*(torch.tensor(v, dtype=like) for v in (-prior.mean, prior.std)))
         if observer.reward == "inverse_range":
             reward, then = inverse_range_from_range(reward), inverse_range_from_range(then)
     else:
-        reward = RewardBelief(moments.mean[..., 2], moments.cov[..., 5].sqrt())
+        reward = RewardBelief(rho, variance.sqrt())
         then = RewardBelief(*(torch.tensor(v, dtype=like) for v in (prior.mean, prior.std)))
         if observer.reward == "range":
             reward, then = range_from_inverse_range(reward), range_from_inverse_range(then)
-    return points, reward, then
+    return points, reward, then, variance
 
 
 def reward_of(observer: Observer, memory: Memory) -> tuple[Gaussian, RewardBelief, Tensor]:
@@ -235,15 +232,14 @@ def reward_of(observer: Observer, memory: Memory) -> tuple[Gaussian, RewardBelie
     leave less and less. Unseen cells that no look has reached share the prior's reward exactly: ties are ties. What no
     look can change is not worth exploring, see `torchfovea.memory.egosphere.reducible`.
     """
-    moments = belief(memory)
-    points, reward, unseen = _rewards(observer, memory, moments)
+    points, reward, unseen, variance = _rewards(observer, memory)
     sure, fruitless = trust(memory), memory.votes[..., 1]
     mean, std = (then.to(reward.mean) for then in unseen)
     std = std * (1 + fruitless).rsqrt()
     mean = torch.where(sure > 0, sure * reward.mean + (1 - sure) * mean, mean)
     whole, open_to_looks = (
         torch.where(sure > 0, sure * known + (1 - sure) * std, std)
-        for known in (reward.std, reward.std * reducible(memory, moments.cov[..., 5]).sqrt())
+        for known in (reward.std, reward.std * reducible(memory, variance).sqrt())
     )
     return points, RewardBelief(mean, whole), open_to_looks
 
@@ -280,10 +276,12 @@ def decide(
     seen = memory.looks > 0
     # the eyes meet where the surface is, or where an unseen one would be while it is more likely not there
     doubted = seen & (trust(memory) < 0.5)
-    target, reachable = fixate(observer.head, torch.where(doubted[..., None], _unseen_points(memory), points.mean))
-    ground = seen & (points.mean[..., 2] + observer.head.ego_height_m < observer.eligibility.ground_z_m)
-    far_enough = (points.mean * points.mean).sum(-1) > observer.eligibility.nearest_m**2
-    eligible = reachable & far_enough & ~ground
+    at, instead = points.mean.unbind(-1), _unseen_points(memory).unbind(-1)
+    target = columns(*(torch.where(doubted, there, here) for there, here in zip(instead, at, strict=True)))
+    x, y, z = at
+    ground = seen & (z + observer.head.ego_height_m < observer.eligibility.ground_z_m)
+    far_enough = (x * x).addcmul_(y, y).addcmul_(z, z) > observer.eligibility.nearest_m**2
+    eligible = can_fixate(observer.head, target) & far_enough & ~ground
     floor = torch.full_like(reward.mean, -torch.inf)
     incumbent = torch.where(eligible & seen, reward.mean, floor).amax(-1)
     incumbent = torch.where(torch.isfinite(incumbent), incumbent, torch.where(eligible, reward.mean, floor).amax(-1))
@@ -302,7 +300,10 @@ def decide(
     )
     score, state = evaluate(strategy, view)
     cell = choose(score, eligible, generator)
-    return Step(memory, points, reward, eligible, cell, gaze_at(target, cell), state)
+    place = cell.clamp(min=0)[..., None]
+    chosen = columns(*(part.gather(-1, place) for part in target.unbind(-1)))
+    gaze = gaze_at(fixate(observer.head, chosen)[0], cell.clamp(max=0))
+    return Step(memory, points, reward, eligible, cell, gaze, state)
 
 
 def gaze_at(gazes: Gaze, cell: Tensor) -> Gaze:

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from torchfovea.gaussian import Gaussian, Information, columns, gaussian_from_information
 from torchfovea.memory.nearest import CellIndex, build_index, neighbour_spacing_rad
+from torchfovea.memory.pooling import nearness
 from torchfovea.setting import require
 
 __all__ = [
@@ -33,10 +34,13 @@ __all__ = [
     "check_chart",
     "empty_memory",
     "forget",
+    "inverse_range_belief",
     "prior_information",
     "reducible",
     "trust",
 ]
+
+FAR_M = 1000.0  # points of patches lie no farther out
 
 
 class Memory(NamedTuple):
@@ -233,9 +237,23 @@ def belief(memory: Memory) -> Gaussian:
     together: with Λ = Σ 1/u, the variance of the mean is (Λ − Σ l/u² + (Σ √l/u)²)/Λ². Differentiable.
     """
     mean, cov = gaussian_from_information(memory.information)
-    once, twice = memory.lasting.unbind(-1)
     *rest, variance = cov.unbind(-1)
-    return Gaussian(mean, columns(*rest, variance + variance.square() * (once.square() - twice).clamp(min=0)))
+    return Gaussian(mean, columns(*rest, variance + variance.square() * _together(memory)))
+
+
+def inverse_range_belief(memory: Memory) -> tuple[Tensor, Tensor]:
+    """Mean and variance (..., Nx) of patches' inverse range at their cells: those of `belief`, without the slopes.
+
+    Differentiable.
+    """
+    rho, variance = nearness(memory.information)
+    return rho, variance + variance.square() * _together(memory)
+
+
+def _together(memory: Memory) -> Tensor:
+    """What lasts of the looks' errors, beyond what each has by itself: (Σ √l/u)² − Σ l/u², (..., Nx)."""
+    once, twice = memory.lasting.unbind(-1)
+    return (once.square() - twice).clamp(min=0)
 
 
 def reducible(memory: Memory, variance: Tensor) -> Tensor:
@@ -249,8 +267,7 @@ def reducible(memory: Memory, variance: Tensor) -> Tensor:
 
     Differentiable.
     """
-    once, twice = memory.lasting.unbind(-1)
-    together = (once.square() - twice).clamp(min=0)
+    together, twice = _together(memory), memory.lasting[..., 1]
     # of V + V² (a² − q), which is known, the V that looks average
     own = 2 * variance / (1 + (1 + 4 * together * variance).sqrt())
     return ((1 - own * twice).clamp(min=0) / (1 + own * together)).clamp(max=1)
@@ -264,24 +281,28 @@ def trust(memory: Memory) -> Tensor:
 
 def cartesian_belief(memory: Memory) -> Gaussian:
     """Moments in 3-D, in E: what information, exports and pictures use. Differentiable."""
-    moments = belief(memory)
-    return moments if memory.chart == "cartesian" else cartesian_from_patches(moments, memory)
+    if memory.chart == "cartesian":
+        return belief(memory)
+    return cartesian_from_patches(*inverse_range_belief(memory), memory)
 
 
-def cartesian_from_patches(moments: Gaussian, memory: Memory, far_m: float = 1000.0) -> Gaussian:
+def cartesian_from_patches(rho: Tensor, variance: Tensor, memory: Memory, far_m: float = FAR_M) -> Gaussian:
     """Cartesian moments of the patches' points in their cells' directions, to first order.
 
     Args:
-        moments: of the patches, from `belief`.
+        rho: inverse ranges of the patches at their cells (..., Nx), from `inverse_range_belief`.
+        variance: theirs.
         memory: whose.
         far_m: an inverse range below 1/far_m is taken as 1/far_m.
 
     Differentiable.
     """
-    r = 1 / moments.mean[..., 2].clamp(min=1 / far_m)
-    across = r * r / memory.bearing
-    along = r**4 * moments.cov[..., 5] - across
+    r = 1 / rho.clamp(min=1 / far_m)
+    square = r * r
+    across = square / memory.bearing
+    along = square * square * variance - across
     x, y, z = memory.cells.unbind(-1)
     mean = columns(r * x, r * y, r * z)
-    xx, yy, zz = across + along * x * x, across + along * y * y, across + along * z * z
-    return Gaussian(mean, columns(xx, along * x * y, along * x * z, yy, along * y * z, zz))
+    ax, ay, az = along * x, along * y, along * z
+    xx, yy, zz = (torch.addcmul(across, a, c) for a, c in ((ax, x), (ay, y), (az, z)))
+    return Gaussian(mean, columns(xx, ax * y, ax * z, yy, ay * z, zz))

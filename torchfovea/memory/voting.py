@@ -19,13 +19,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchfovea.gaussian import columns, quadratic3
+from torchfovea.gaussian import Information, columns, quadratic3
 from torchfovea.memory.association import Pairs, gather_columns, in_front
-from torchfovea.memory.egosphere import Fusion, Memory, belief
+from torchfovea.memory.egosphere import FAR_M, Fusion, Memory, belief
+from torchfovea.memory.pooling import nearness
+from torchfovea.sensing.camera import Camera
 from torchfovea.sensing.chart import basis
+from torchfovea.sensing.head import Eyes, to_ego
+from torchfovea.sensing.layout import Retina
 from torchfovea.sensing.triangulation import Observations
 
-__all__ = ["Ballot", "Sight", "against", "cast", "see"]
+__all__ = ["Ballot", "Sight", "against", "cast", "see", "within_sight"]
 
 
 TIE = 1.001  # votes that differ by less leave a cell what it has: no rounding decides
@@ -99,22 +103,25 @@ def cast(sight: Sight, memory: Memory, fusion: Fusion) -> Ballot:
 
     Differentiable in the inlier probabilities; which observations agree is held fixed.
     """
-    prior, patches, seen = memory.prior, belief(memory), memory.looks > 0
+    prior, seen = memory.prior, memory.looks > 0
     mean, std, slope_std = prior.mean, prior.std, prior.slope_std
     conflict = fusion.conflict
     shape, count = seen.shape, seen.numel()
     has, at = seen.reshape(-1), sight.cell
     with torch.no_grad():
-        told = has.index_select(0, at)
-        off = sight.row[..., 0].square() + sight.row[..., 1].square()
-        spread = (sight.variance + slope_std**2 * off).sqrt()
-        held = gather_columns(patches.mean, at)
-        expected = (sight.row * held).sum(-1)
-        variance = sight.variance + quadratic3(gather_columns(patches.cov, at), sight.row)
-        agrees = told & ((sight.rho - expected).square() < conflict**2 * variance)
-        # of what does not agree, the nearest surface hides the rest from E, if it is one
-        rest = ~agrees
-        ahead = rest & in_front(sight.rho, spread, at, count, conflict, rest & (sight.inlier > 0.5))
+        agrees = has.index_select(0, at)
+        ahead = ~agrees
+        if conflict < math.inf:
+            x, y, z = sight.row.unbind(-1)
+            patches = belief(memory)
+            a, b, rho = gather_columns(patches.mean, at).unbind(-1)
+            variance = sight.variance + quadratic3(gather_columns(patches.cov, at), sight.row)
+            off = (sight.rho - (a * x).addcmul_(b, y).addcmul_(rho, z)).square()
+            agrees &= off < conflict**2 * variance
+            # of what does not agree, the nearest surface hides the rest from E, if it is one
+            rest = ~agrees
+            spread = (sight.variance + slope_std**2 * (x * x).addcmul_(y, y)).sqrt()
+            ahead = rest & in_front(sight.rho, spread, at, count, conflict, rest & (sight.inlier > 0.5))
         # how much more often true surfaces lie there than false matches, which are even in inverse range
         usual = math.log(std * math.sqrt(2 * math.pi) * fusion.nearest_m) + ((sight.rho - mean) / std).square() / 2
         odds = torch.exp(-usual.clamp(min=0))
@@ -148,3 +155,33 @@ def against(votes: Tensor, missed: Tensor) -> Tensor:
     """Votes (..., Nx, 2) after a look that should have shown some cells' surfaces, bool (..., Nx), and did not."""
     yes, no = votes.unbind(-1)
     return columns(yes, no + missed.to(no))
+
+
+def within_sight(memory: Memory, among: Tensor, eyes: Eyes, camera: Camera, retina: Retina) -> Tensor:
+    """Which of some cells have points that fall on both retinas.
+
+    Args:
+        memory: of patches.
+        among: the cells that are asked, bool (..., Nx).
+        eyes: their poses (...).
+        camera: of both.
+        retina: of both.
+
+    Returns:
+        bool (..., Nx); False where not asked. Not differentiable.
+    """
+    with torch.no_grad():
+        lead, which = among.shape[:-1], among.reshape(-1).nonzero().squeeze(1)
+        vector, matrix, cells = (gather_columns(part, which) for part in (*memory.information, memory.cells))
+        rho = nearness(Information(vector, matrix))[0].clamp(min=1 / FAR_M)[:, None]
+        inside = torch.ones_like(rho, dtype=torch.bool)
+        for rotation, origin in ((eyes.R_left, eyes.t_left), (eyes.R_right, eyes.t_right)):
+            rotation, origin = rotation.expand(*lead, 3, 3).reshape(-1, 3, 3), origin.expand(*lead, 3).reshape(-1, 3)
+            if len(rotation) > 1:
+                row = which // among.shape[-1]
+                rotation, origin = rotation.index_select(0, row), origin.index_select(0, row)
+            # directions to points p/ρ, times ρ
+            eye = zip(cells[:, None].unbind(-1), origin.unbind(-1), strict=True)
+            ray = to_ego(rotation.mT, columns(*(c - rho * o[:, None] for c, o in eye)))
+            inside &= camera.in_view(ray) & retina.inside(camera.project(ray))
+    return torch.zeros_like(among).view(-1).index_put_((which,), inside[:, 0]).view(among.shape)

@@ -17,7 +17,19 @@ from torch import Tensor
 from torchfovea.gaussian import columns
 from torchfovea.setting import require
 
-__all__ = ["Eyes", "Gaze", "Head", "clamp_gaze", "cyclopean", "eyes", "fixate", "gaze_point", "rig_frame", "to_ego"]
+__all__ = [
+    "Eyes",
+    "Gaze",
+    "Head",
+    "can_fixate",
+    "clamp_gaze",
+    "cyclopean",
+    "eyes",
+    "fixate",
+    "gaze_point",
+    "rig_frame",
+    "to_ego",
+]
 
 
 _FARTHEST_M = 1e12
@@ -170,38 +182,69 @@ def fixate(head: Head, point: Tensor) -> tuple[Gaze, Tensor]:
 
     Differentiable in the point where it is reachable; zero gradient where it is not.
     """
-    good = point.dim() >= 1 and point.shape[-1] == 3 and point.is_floating_point()
-    require(good, "point", f"{tuple(point.shape)} {point.dtype}", "a floating-point tensor (..., 3)")
-    finite = torch.isfinite(point).all(-1)
-    point = torch.where(finite[..., None], point, torch.ones_like(point))
-    largest = point.detach().abs().amax(-1, keepdim=True)
-    # all angles are there long before squares overflow
-    x, y, z = (point * (_FARTHEST_M / largest.clamp(min=_FARTHEST_M))).unbind(-1)
-    side = x * x + y * y
-    up, forward = head.eyes_up_m, head.eyes_forward_m
-    # in the neck's vertical plane the point is at (d + forward, up): |X|² = (d + forward)² + up²
-    ahead = side + z * z - up * up
-    near = head.baseline_m / 2 / math.tan(math.radians(head.vergence_max_deg) / 2)
-    solvable = finite & (side > 1e-12) & (ahead > max(forward + 1e-3, 1e-3) ** 2)
-    one = torch.ones_like(x)
-    xs, ys, zs = (torch.where(solvable, c, one) for c in (x, y, z))
-    reach = torch.where(solvable, ahead, one).sqrt()
-    distance = (reach - forward).clamp(min=1e-6)
-    pan = torch.atan2(ys, xs)
-    tilt = torch.atan2(torch.full_like(reach, up), reach) - torch.atan2(zs, (xs * xs + ys * ys).sqrt())
+    (x, y, z), side, reach, solvable, within = _aim(head, point)
+    distance = (reach - head.eyes_forward_m).clamp(min=1e-6)
+    pan = torch.atan2(y, x)
+    tilt = torch.atan2(torch.full_like(reach, head.eyes_up_m), reach) - torch.atan2(z, side)
     vergence = 2 * torch.atan2(torch.full_like(distance, head.baseline_m / 2), distance)
-    pan_limit, up_limit, down_limit = (
-        math.radians(a) for a in (head.pan_limit_deg, -head.tilt_up_deg, head.tilt_down_deg)
-    )
-    within = (pan.abs() <= pan_limit) & (tilt >= up_limit) & (tilt <= down_limit) & (distance >= near)
+    pan_limit, up_limit, down_limit = (math.radians(a) for a in _limits_deg(head))
     gaze = Gaze(
         pan.clamp(-pan_limit, pan_limit),
         tilt.clamp(up_limit, down_limit),
         vergence.clamp(max=math.radians(head.vergence_max_deg)),
     )
-    reachable = solvable & within
-    held = (torch.where(reachable, angle, angle.detach()) for angle in gaze)
-    return Gaze(*(torch.where(solvable, angle, torch.zeros_like(angle)) for angle in held)), reachable
+    held = (torch.where(within, angle, angle.detach()) for angle in gaze)
+    return Gaze(*(torch.where(solvable, angle, torch.zeros_like(angle)) for angle in held)), within
+
+
+def can_fixate(head: Head, point: Tensor) -> Tensor:
+    """Whether the head can fixate points (..., 3) in E, bool (...): the second result of `fixate`, without the angles.
+
+    Raises:
+        SettingError: for a point of another shape, or of whole numbers.
+    """
+    return _aim(head, point.detach())[-1]
+
+
+def _limits_deg(head: Head) -> tuple[float, float, float]:
+    """Of pan to either side, and of tilt, up and down."""
+    return head.pan_limit_deg, -head.tilt_up_deg, head.tilt_down_deg
+
+
+def _aim(head: Head, point: Tensor) -> tuple[tuple[Tensor, ...], Tensor, Tensor, Tensor, Tensor]:
+    """A point as the head's inverse kinematics wants it.
+
+    Returns:
+        x, y and z; √(x² + y²); √(|X|² − up²), how far before the tilt axis the gaze meets it; whether there is a gaze
+        at all; whether it lies within the limits. Where there is none the numbers are 1.
+    """
+    good = point.dim() >= 1 and point.shape[-1] == 3 and point.is_floating_point()
+    require(good, "point", f"{tuple(point.shape)} {point.dtype}", "a floating-point tensor (..., 3)")
+    x, y, z = point.unbind(-1)
+    with torch.no_grad():
+        largest = torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs())
+        finite = largest < math.inf
+        # all angles are there long before squares overflow; what is not finite counts as a point at the origin
+        less = torch.where(finite, _FARTHEST_M / largest.clamp(min=_FARTHEST_M), 0.0)
+    one = torch.ones_like(x)
+    x, y, z = (torch.where(finite, c, one) * less for c in (x, y, z))
+    up, forward = head.eyes_up_m, head.eyes_forward_m
+    # in the neck's vertical plane the point is at (d + forward, up): |X|² = (d + forward)² + up²
+    side = x * x + y * y
+    ahead = side + z * z - up * up
+    solvable = (side > 1e-12) & (ahead > max(forward + 1e-3, 1e-3) ** 2)
+    x, y, z = (torch.where(solvable, c, one) for c in (x, y, z))
+    side, reach = (torch.where(solvable, square, one).sqrt() for square in (side, ahead))
+    near = head.baseline_m / 2 / math.tan(math.radians(head.vergence_max_deg) / 2)
+    with torch.no_grad():
+        # angles α ≤ β where sin(β − α) ≥ 0: of pan, and of tilt, the angle from (side, z) to (reach, up)
+        (pan_s, pan_c), (up_s, up_c), (down_s, down_c) = (
+            (math.sin(math.radians(a)), math.cos(math.radians(a))) for a in _limits_deg(head)
+        )
+        sine, cosine = up * side - reach * z, reach * side + up * z
+        within = (pan_s * x >= pan_c * y.abs()) & (up_c * sine >= up_s * cosine) & (down_c * sine <= down_s * cosine)
+        within &= solvable & (reach - forward >= near)
+    return (x, y, z), side, reach, solvable, within
 
 
 def gaze_point(head: Head, gaze: Gaze) -> Tensor:
