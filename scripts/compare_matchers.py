@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from torchfovea.experiments.pairs import motorcycle
+from torchfovea.commands.shared.pairs import motorcycle
 from torchfovea.sensing.camera import Pinhole
 from torchfovea.sensing.correspondence import Correspondences
 from torchfovea.sensing.head import eyes, fixate

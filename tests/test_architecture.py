@@ -87,21 +87,21 @@ FLOORS = (
     ("search", "arena"),
     ("tuning", "episode"),
     ("sim",),
-    ("pictures", "config", "mistakes", "trust"),
-    ("cli", "experiments", "doctor", "bench", "__main__"),
+    ("commands",),
+    ("cli", "__main__"),
 )
 FLOOR = {module: floor for floor, modules in enumerate(FLOORS) for module in modules}
 
-# Heavy packages, and the only modules that may import them.
+# Heavy packages, and the only modules (of the plan, or files anywhere by their stem) that may import them.
 ONLY_IN = {
     "mujoco": {"sim"},
-    "hydra": {"cli", "config", "mistakes", "trust", "experiments"},
-    "omegaconf": {"cli", "config", "mistakes", "trust", "experiments", "doctor"},
+    "hydra": {"cli", "commands"},
+    "omegaconf": {"cli", "commands"},
     "matplotlib": {"pictures"},
-    "cv2": {"sgbm", "disparity_files", "bench", "experiments"},
-    "rich": {"cli", "experiments", "doctor"},
-    "joblib": {"experiments"},
-    "skimage": {"experiments"},
+    "cv2": {"sgbm", "disparity_files", "commands"},
+    "rich": {"cli", "commands"},
+    "joblib": {"commands"},
+    "skimage": {"commands"},
 }
 
 
@@ -169,10 +169,21 @@ def test_no_circles():
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
 def test_heavy_packages_stop_at_their_floor(path):
-    module = module_of(path)
+    here = {module_of(path), path.stem}
     used = {name.partition(".")[0] for name in imports_of(path)}
-    strays = sorted(package for package, allowed in ONLY_IN.items() if package in used and module not in allowed)
-    assert not strays, f"{module} may not import {strays}"
+    strays = sorted(package for package, allowed in ONLY_IN.items() if package in used and not here & allowed)
+    assert not strays, f"{name_of(path)} may not import {strays}"
+
+
+@pytest.mark.parametrize("path", sorted((PACKAGE / "commands").rglob("*.py")), ids=name_of)
+def test_commands_share_only_what_is_shared(path):
+    own = path.relative_to(PACKAGE / "commands").parts[0].removesuffix(".py")
+    others = {
+        name
+        for name in imports_of(path)
+        if name.startswith("torchfovea.commands.") and name.split(".")[2] not in {own, "shared"}
+    }
+    assert not others, f"the command {own} imports from another's folder: {sorted(others)}"
 
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)

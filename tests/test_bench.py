@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from torchfovea.bench import paths, retina_paths, steps, timing
-from torchfovea.bench.look import saccade
-from torchfovea.bench.timing import Growth, Path, copy_bandwidth, interleaved, nbytes, same, slope
 from torchfovea.cli import main
-from torchfovea.experiments import bench
+from torchfovea.commands.bench import command as bench
+from torchfovea.commands.bench import paths, retina_paths, steps, timing
+from torchfovea.commands.bench.look import saccade
+from torchfovea.commands.bench.timing import Growth, Path, copy_bandwidth, interleaved, nbytes, same, slope
 from torchfovea.memory import sphere
 from torchfovea.memory.egosphere import Fusion
 from torchfovea.perception import Observer

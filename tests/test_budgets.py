@@ -12,10 +12,10 @@ from omegaconf import OmegaConf
 from synthetic import observations, without_clues
 
 from torchfovea.cli import main
-from torchfovea.config import conf_dir
-from torchfovea.experiments.budgets import build_budget, load_budget, made_for, shipped, write_budget
-from torchfovea.experiments.pairs import load_folder, named_pair
-from torchfovea.experiments.regions import REGIONS, hidden_places, regions, truth_step_px
+from torchfovea.commands.shared.budgets import build_budget, load_budget, made_for, shipped, write_budget
+from torchfovea.commands.shared.config import conf_dir
+from torchfovea.commands.shared.pairs import load_folder, named_pair
+from torchfovea.commands.shared.regions import REGIONS, hidden_places, regions, truth_step_px
 from torchfovea.sensing.correspondence import Budget, Clues, doubt, inlier_share
 from torchfovea.sensing.kinship import once_a_pixel
 from torchfovea.setting import SettingError

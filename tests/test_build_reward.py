@@ -7,8 +7,8 @@ import torch
 from hydra import compose, initialize_config_dir
 
 from torchfovea.cli import main
-from torchfovea.config import conf_dir
-from torchfovea.experiments.rewards import build_reward
+from torchfovea.commands.shared.config import conf_dir
+from torchfovea.commands.shared.rewards import build_reward
 from torchfovea.setting import SettingError
 
 

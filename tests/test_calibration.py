@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from synthetic import LINE, observations, without_clues
 
 from torchfovea.cli import main
-from torchfovea.experiments.regions import REGIONS
+from torchfovea.commands.shared.regions import REGIONS
 from torchfovea.sensing.camera import Fisheye, Pinhole
 from torchfovea.sensing.correspondence import Budget, Clues, Correspondences, Disparity, eye_sigma_px
 from torchfovea.sensing.geometric import correspond_points
@@ -439,8 +439,8 @@ def test_a_mistake_is_one_line_and_leaves_nothing(folder, capsys, overrides, lin
 def test_the_budgets_that_come_along(name):
     from hydra import compose, initialize_config_dir
 
-    from torchfovea.config import conf_dir
-    from torchfovea.experiments.build import construct
+    from torchfovea.commands.shared.build import construct
+    from torchfovea.commands.shared.config import conf_dir
 
     with initialize_config_dir(conf_dir(), version_base="1.3"):
         cfg = compose("sense", [f"budget={name}"])

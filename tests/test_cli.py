@@ -120,7 +120,7 @@ def test_a_broken_file_of_a_group_is_named(job, capsys, tmp_path):
 
 def test_a_package_that_the_end_needs_is_missed_at_the_beginning(job, capsys, monkeypatch):
     """Without matplotlib a search would find out after its episodes."""
-    from torchfovea import mistakes
+    from torchfovea.commands.shared import mistakes
 
     find = mistakes.importlib.util.find_spec
     monkeypatch.setattr(mistakes.importlib.util, "find_spec", lambda n: None if n == "matplotlib" else find(n))
@@ -140,7 +140,7 @@ def test_unknown_command(capsys):
 
 
 def test_a_run_prints_its_folder_last_and_keeps_its_settings(job, capsys, tmp_path):
-    job("from torchfovea.config import run_folder\n(run_folder() / 'x').touch()\nprint('hello')")
+    job("from torchfovea.commands.shared.config import run_folder\n(run_folder() / 'x').touch()\nprint('hello')")
     assert main(["doctor", "seed=7"]) == 0
     first, last = capsys.readouterr().out.splitlines()
     assert first == "hello"
@@ -156,7 +156,10 @@ def test_a_setting_can_be_wrong(job, capsys, tmp_path):
 
 
 def test_a_failed_run_keeps_what_it_wrote(job, capsys, tmp_path):
-    job("import os\nfrom torchfovea.config import run_folder\n(run_folder() / 'x').touch()\nopen('nowhere.png')")
+    job(
+        "import os\nfrom torchfovea.commands.shared.config import run_folder\n"
+        "(run_folder() / 'x').touch()\nopen('nowhere.png')"
+    )
     fails_with(capsys, "nowhere.png: No such file or directory")
     (folder,) = (tmp_path / "outputs" / "doctor").iterdir()
     assert (folder / "x").exists()
@@ -235,14 +238,14 @@ def test_one_failing_job_does_not_stop_the_others(launcher, job, capfd, tmp_path
     if launcher == "joblib":
         pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     job(
-        "from torchfovea.files import write_result\nfrom torchfovea.config import run_folder\n"
+        "from torchfovea.files import write_result\nfrom torchfovea.commands.shared.config import run_folder\n"
         "require(cfg.seed != 1, 'seed', cfg.seed, 'another')\n"
         "assert cfg.seed != 2, 'a bug'\n"
         "write_result(run_folder(), {'seed': cfg.seed})"
     )
     if launcher == "joblib":
         # Workers look the command up for themselves: give them the real one, whose checks fail for one job.
-        COMMANDS["doctor"] = Command("torchfovea.doctor:run", "", "")
+        COMMANDS["doctor"] = Command("torchfovea.commands.doctor:run", "", "")
         # Those of an earlier sweep would keep its working folder and write to where its output went.
         get_reusable_executor().shutdown()
         sweep = ["probe_timeout_s=60,-1", "hydra.launcher.n_jobs=2", f"hydra.sweep.dir={tmp_path}/multirun/doctor/it"]

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import torchfovea
+from torchfovea.cli import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "torchfovea"
@@ -69,9 +70,8 @@ FRONT_DOOR = [
 
 # Names that two modules define on purpose: which modules, by reason.
 ON_NUMBERS_AND_ON_A_VIEW = {"deciding.acquisition", "deciding.strategies"}  # one formula, its callers differ
-FROM_SETTINGS = {"deciding.strategies", "experiments.strategy"}  # the latter checks settings and returns the former
-COMMANDS = ("bench", "calibrate", "characterize", "collect", "memory", "reproduce", "search", "sense", "tune")
-PEER = "bench.peers"  # what others would write for the function of that name, to be timed against it
+FROM_SETTINGS = {"deciding.strategies", "commands.shared.strategy"}  # the latter checks settings and returns the former
+PEER = "commands.bench.peers"  # what others would write for the function of that name, to be timed against it
 TWICE = {
     "expected_improvement": ON_NUMBERS_AND_ON_A_VIEW,
     "log_expected_improvement": ON_NUMBERS_AND_ON_A_VIEW,
@@ -82,12 +82,14 @@ TWICE = {
     "hedge": FROM_SETTINGS,
     "oracle": FROM_SETTINGS,
     "raster": FROM_SETTINGS,
-    "nearest_to": {"deciding.reward", "experiments.rewards"},  # as above, for rewards
+    "nearest_to": {"deciding.reward", "commands.shared.rewards"},  # as above, for rewards
     "decide": {"perception", PEER},
     "unscented": {"studies.propagation", PEER},
     "Seen": {"sim.world", PEER},  # its like, without torch
     "render": {"sim.rays", "sim.gl"},  # two renderers, one protocol
-    "run": {"doctor", *(f"experiments.{command}" for command in COMMANDS)},  # each command's door
+    "run": {
+        command.target.removeprefix("torchfovea.").removesuffix(":run") for command in COMMANDS.values()
+    },  # each command's door
     "cast": {"sim.rays", "memory.voting"},  # a ray, and a vote
     "coverage": {"metrics", "tuning.estimators"},  # estimators bear the names that `tune` knows them by
     "covered": {"sensing.retina", "tuning.estimators"},

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from torchfovea.config import conf_dir
+from torchfovea.commands.shared.config import conf_dir
 from torchfovea.sensing.camera import Fisheye, Pinhole, image_camera
 from torchfovea.sensing.correspondence import Budget, Disparity, eye_sigma_px
 from torchfovea.sensing.retina import LogPolar, Uniform

@@ -5,15 +5,15 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from torchfovea.cli import main
-from torchfovea.config import conf_dir
-from torchfovea.experiments.build import build_match, build_motor, build_renderer, build_scene_of, build_sensor
-from torchfovea.experiments.strategy import build_strategy
+from torchfovea.commands.shared.build import build_match, build_motor, build_renderer, build_scene_of, build_sensor
+from torchfovea.commands.shared.config import conf_dir
+from torchfovea.commands.shared.strategy import build_strategy
+from torchfovea.commands.shared.trust import load_trusted
 from torchfovea.imported import load_function, load_object
 from torchfovea.perception import Observer
 from torchfovea.sensing.head import Head
 from torchfovea.setting import SettingError
 from torchfovea.sim.scene import AttentionWorld, Room
-from torchfovea.trust import load_trusted
 
 OWN = """
 from collections import namedtuple
@@ -189,7 +189,7 @@ def test_a_strangers_folder_runs_nothing_without_trust(own, tmp_path, capsys, tr
     (conf / "theirs.yaml").write_text(
         "# @package _global_\nhydra:\n  callbacks:\n    theirs:\n"
         f"      _target_: callback_of_theirs.make\n      path: {ran}\nacquisition:\n  name: ucb\n  alpha: 1.0\n"
-        "  _target_: torchfovea.experiments.strategy.ucb\n"
+        "  _target_: torchfovea.commands.shared.strategy.ucb\n"
     )
     command = ["search", "--config-dir", str(conf.parent), "acquisition=theirs", *TINY, f"hydra.run.dir={tmp_path}/run"]
     if trusted:

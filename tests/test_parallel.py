@@ -5,7 +5,7 @@ import os
 import pytest
 
 from torchfovea.cli import main
-from torchfovea.experiments.parallel import spread
+from torchfovea.commands.shared.parallel import spread
 from torchfovea.setting import SettingError
 
 SENSORS = ("log_polar", "uniform")

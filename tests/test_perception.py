@@ -10,13 +10,13 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from torchfovea.config import conf_dir
+from torchfovea.commands.shared.build import build_observer
+from torchfovea.commands.shared.config import conf_dir
+from torchfovea.commands.shared.named import targets_of
+from torchfovea.commands.shared.strategy import build_stop, build_strategy
 from torchfovea.deciding import acquisition, strategies
 from torchfovea.deciding.reward import nearest_to
 from torchfovea.deciding.strategies import View
-from torchfovea.experiments.build import build_observer
-from torchfovea.experiments.named import targets_of
-from torchfovea.experiments.strategy import build_stop, build_strategy
 from torchfovea.gaussian import Information
 from torchfovea.memory.egosphere import Fusion, Prior
 from torchfovea.memory.sphere import fibonacci_directions

@@ -12,9 +12,9 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from torchfovea.cli import main
-from torchfovea.config import conf_dir
-from torchfovea.experiments import cells
-from torchfovea.experiments.claims import Claim, judge_claims, read_claims
+from torchfovea.commands.reproduce import cells
+from torchfovea.commands.reproduce.claims import Claim, judge_claims, read_claims
+from torchfovea.commands.shared.config import conf_dir
 from torchfovea.setting import SettingError
 
 SMALL = (

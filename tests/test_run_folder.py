@@ -6,7 +6,7 @@ import threading
 import pytest
 
 from torchfovea.cli import main
-from torchfovea.experiments.manifest import MANIFEST
+from torchfovea.commands.shared.manifest import MANIFEST
 from torchfovea.files import create_json
 
 TINY = [
@@ -48,7 +48,7 @@ def test_one_of_many_writers_makes_a_file(tmp_path):
 
 def test_of_two_runs_that_begin_together_one_is_refused(tmp_path, monkeypatch, capsys):
     """The other run makes its manifest after this one has seen none."""
-    from torchfovea.experiments import manifest
+    from torchfovea.commands.shared import manifest
 
     def other_first(path, content):
         create_json(path, {**content, "config_hash": "another's"})

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from torchfovea.cli import main
-from torchfovea.experiments.images import read_image, write_ply
+from torchfovea.commands.shared.images import read_image, write_ply
 from torchfovea.setting import SettingError
 from torchfovea.stereo.disparity_files import load_disparity
 

@@ -7,7 +7,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 
 from torchfovea.cli import main
-from torchfovea.config import conf_dir
+from torchfovea.commands.shared.config import conf_dir
 
 SEARCH = "fidelity=geometric episodes=1 saccades=2 sensor.receptive_fields=400 memory.cells=60 picture=false"
 TUNE = "profile=quick episodes=64 validations=2 validation_scenes=16 heldout_scenes=32 prior_field=false"

@@ -13,8 +13,8 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from torchfovea.cli import main
-from torchfovea.config import conf_dir
-from torchfovea.experiments.manifest import config_hash
+from torchfovea.commands.shared.config import conf_dir
+from torchfovea.commands.shared.manifest import config_hash
 
 TINY = [
     "fidelity=geometric", "episodes=1", "saccades=2", "sensor.receptive_fields=200", "memory.cells=60", "picture=false",
@@ -70,7 +70,7 @@ def test_no_worker_outlives_a_killed_command():
     # two that would work for minutes
     script = (
         "import os, time\n"
-        "from torchfovea.experiments.parallel import spread\n"
+        "from torchfovea.commands.shared.parallel import spread\n"
         "def work(k):\n"
         "    time.sleep(600 if k > 1 else 0.5)\n"
         "    return os.getpid()\n"

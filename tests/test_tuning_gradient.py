@@ -11,7 +11,7 @@ import torch
 from omegaconf import OmegaConf
 
 from torchfovea.cli import main
-from torchfovea.experiments.build import build_cells
+from torchfovea.commands.shared.build import build_cells
 from torchfovea.memory.egosphere import Prior
 from torchfovea.memory.sphere import direction_mixture, log_density, log_normalizer, sphere_quadrature
 from torchfovea.perception import Observer

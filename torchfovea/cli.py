@@ -33,61 +33,61 @@ class Command(NamedTuple):
 # Hydra's sweepers see.
 COMMANDS: dict[str, Command] = {
     "search": Command(
-        "torchfovea.experiments.search:run",
+        "torchfovea.commands.search.command:run",
         "find the nearest object by saccades, and map the scene: the main job",
         "torchfovea search scene=cans sensor=uniform acquisition.alpha=2",
         resumes=True,
         draws=True,
     ),
     "sense": Command(
-        "torchfovea.experiments.sense:run",
+        "torchfovea.commands.sense.command:run",
         "a stereo pair in, 3-D points with covariances out",
         "torchfovea sense pair=motorcycle",
         draws=True,
     ),
     "characterize": Command(
-        "torchfovea.experiments.characterize:run",
+        "torchfovea.commands.characterize.command:run",
         "what two eyes know of planes, foveal and uniform (Fig. 5), and how far to believe it",
         "torchfovea characterize profile=quick",
         resumes=True,
         draws=True,
     ),
     "tune": Command(
-        "torchfovea.experiments.tune:run",
+        "torchfovea.commands.tune.command:run",
         "learn the memory's bias and alpha by gradient on simulated episodes",
         "torchfovea tune profile=quick distribution=left_below",
         resumes=True,
         draws=True,
     ),
     "reproduce": Command(
-        "torchfovea.experiments.reproduce:run",
+        "torchfovea.commands.reproduce.command:run",
         "the paper's figures and claims, measured again, with intervals and verdicts",
         "torchfovea reproduce profile=quick",
         resumes=True,
         draws=True,
     ),
     "collect": Command(
-        "torchfovea.experiments.collect:run",
+        "torchfovea.commands.collect:run",
         "a sweep's results in one table",
         "torchfovea collect dir=multirun/search/study",
     ),
     "calibrate": Command(
-        "torchfovea.experiments.calibrate:run",
+        "torchfovea.commands.calibrate.command:run",
         "is the claimed uncertainty true? fit the error budget and judge it",
         "torchfovea calibrate real=true",
         draws=True,
     ),
     "memory": Command(
-        "torchfovea.experiments.memory:run",
+        "torchfovea.commands.memory.command:run",
         "draw and describe a memory's bias, or study how the memory fuses, moves and is drawn anew",
         "torchfovea memory memory=target",
     ),
     "bench": Command(
-        "torchfovea.experiments.bench:run",
+        "torchfovea.commands.bench.command:run",
         "how long the hot paths take, beside the peers that one would pick",
         "torchfovea bench profile=quick",
     ),
-    "doctor": Command("torchfovea.doctor:run", "what this machine can render and has", "torchfovea doctor"),
+    "doctor": Command("torchfovea.commands.doctor:run", "what this machine can render and has", "torchfovea doctor"),
 }
 
 
@@ -126,7 +126,7 @@ def _dispatch(arguments: list[str]) -> int:
         print(f"torchfovea {torchfovea.__version__}")
         return 0
     if chosen not in COMMANDS:
-        from torchfovea.mistakes import closest
+        from torchfovea.commands.shared.mistakes import closest
 
         _complain("torchfovea", f"command = {chosen}: expected one of {', '.join(COMMANDS)}{closest(chosen, COMMANDS)}")
         return 2
@@ -176,10 +176,10 @@ def _close_logs() -> None:
 def _run(command: str, overrides: list[str]) -> int:
     import hydra
 
-    from torchfovea.config import SweepFolder, conf_dir, help_text
-    from torchfovea.mistakes import arranged, describe
+    from torchfovea.commands.shared.config import SweepFolder, conf_dir, help_text
+    from torchfovea.commands.shared.mistakes import arranged, describe
+    from torchfovea.commands.shared.trust import refuse_foreign
     from torchfovea.setting import SettingError
-    from torchfovea.trust import refuse_foreign
 
     try:
         overrides = arranged(overrides)
@@ -218,8 +218,8 @@ def _run(command: str, overrides: list[str]) -> int:
 def _known_settings(command: str) -> list[str]:
     from hydra import compose, initialize_config_dir
 
-    from torchfovea.config import conf_dir
-    from torchfovea.mistakes import setting_names
+    from torchfovea.commands.shared.config import conf_dir
+    from torchfovea.commands.shared.mistakes import setting_names
 
     with initialize_config_dir(conf_dir(), version_base="1.3"):
         return setting_names(compose(config_name=command))
@@ -232,10 +232,10 @@ def _job(command: str, overrides: list[str], full_error: bool) -> Callable[[Any]
         from hydra.core.hydra_config import HydraConfig
         from omegaconf import OmegaConf
 
-        from torchfovea.config import run_folder
-        from torchfovea.experiments.manifest import MANIFEST, record, unclaimed, withdraw
-        from torchfovea.mistakes import describe, need
-        from torchfovea.trust import check_said
+        from torchfovea.commands.shared.config import run_folder
+        from torchfovea.commands.shared.manifest import MANIFEST, record, unclaimed, withdraw
+        from torchfovea.commands.shared.mistakes import describe, need
+        from torchfovea.commands.shared.trust import check_said
 
         folder = run_folder()
         settings = HydraConfig.get().job

@@ -60,7 +60,7 @@ class Judged(NamedTuple):
         range_m: true distance from the left eye.
         eccentricity_rad: of the left receptive field.
         place_px: where the left receptive field lies, its two columns: (N, 2) [source px from the axis].
-        region: what it looks at, an index of `torchfovea.experiments.regions.REGIONS`; 0 where nobody asked.
+        region: what it looks at, an index of `torchfovea.commands.shared.regions.REGIONS`; 0 where nobody asked.
     """
 
     error: Tensor

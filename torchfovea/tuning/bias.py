@@ -18,7 +18,7 @@ __all__ = [
     "log_normalizer_each", "mixture_of", "reachable",
 ]  # fmt: skip
 
-REACH_RANGE_M = 1.0  # as in `torchfovea.experiments.build`: a direction is reachable if its point at 1 m is
+REACH_RANGE_M = 1.0  # as in `torchfovea.commands.shared.build`: a direction is reachable if its point at 1 m is
 _LOG_DIAGONAL = (-3.0, 1.0)
 _LOG_ALPHA = (-4.0, 4.0)
 _MEAN = 4.0

@@ -1,0 +1,139 @@
+"""The long paths: a picture, a photometric saccade, geometric and tuning episodes, each as an entry of the bench.
+
+Every function takes the command's configuration and the observer it describes, and gives a `Path`.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from torchfovea.commands.bench.timing import Path, Peer, same
+from torchfovea.commands.shared.build import build_arena, build_cells, build_scene_of, number, whole
+from torchfovea.commands.shared.rollout import roll_out
+from torchfovea.perception import Observer, Step, decide, new_memory, perceive
+from torchfovea.sensing.camera import image_camera
+from torchfovea.sensing.head import Gaze, eyes
+from torchfovea.sim import gl, rays
+from torchfovea.tuning.scenes import Distribution, draw_scenes
+from torchfovea.tuning.simulator import Task, Worlds, simulate, world_of
+
+__all__ = ["episode", "photometric_saccade", "picture", "tuning_episode"]
+
+
+def picture(cfg: DictConfig, observer: Observer, size: int) -> Path:
+    """One picture by rays, and by OpenGL where there is any."""
+    scene = build_scene_of(cfg, observer.head, int(cfg.seed))
+    zero = torch.zeros(())
+    pose = eyes(observer.head, Gaze(zero, zero + 0.3, zero + 0.1))
+    camera = image_camera(observer.camera, observer.retina.radius_px, size)
+    by_rays, by_gl = (partial(module.render, scene, pose.R_left, pose.t_left, camera, size) for module in (rays, gl))
+    backend = gl.available_gl()
+
+    def check() -> None:
+        ours = by_rays()
+        hits = ours.geom >= 0
+        if not bool(hits.float().mean() > 0.5):
+            raise RuntimeError("render: rays that hit nothing")
+        if backend is not None:
+            same("render", ours.range_m[hits], by_gl().range_m[hits], 0.02, 0.97)
+
+    shown = by_rays()
+    return Path(
+        "render",
+        f"a picture of {size} x {size} by rays",
+        "cpu",
+        by_rays,
+        () if backend is None else (Peer(f"OpenGL, {backend}", by_gl),),
+        check,
+        sum(part.numel() * part.element_size() for part in shown),
+    )
+
+
+def photometric_saccade(cfg: DictConfig, observer: Observer) -> Path:
+    """All of a photometric saccade: both eyes' pictures by rays, matching, triangulation, memory, decision."""
+    settings = OmegaConf.merge(cfg, {"fidelity": "photometric", "sensor": {"sample": None}})
+    assert isinstance(settings, DictConfig)
+    arena, generator = build_arena(settings, observer, int(cfg.seed)), torch.Generator().manual_seed(int(cfg.seed))
+    memory = new_memory(observer, build_cells(cfg, observer.head, generator))
+    zero = torch.zeros(())
+    gaze = Gaze(zero, zero + 0.3, zero + 0.1)
+
+    def saccade() -> Step:
+        look = arena.look(gaze, generator)
+        return decide(observer, perceive(observer, memory, look.matches, eyes(observer.head, gaze)), generator)
+
+    def check() -> None:
+        if int(saccade().cell) < 0:
+            raise RuntimeError("saccade: nothing to fixate")
+
+    work = f"two pictures of {arena.world.source_px} px by rays, {cfg.matcher.name}, to the next fixation"
+    return Path("saccade", work, "cpu", saccade, (), check)
+
+
+def episode(cfg: DictConfig, observer: Observer, batch: int, device: str) -> Path:
+    """Geometric episodes that advance together, and the same one by one."""
+    cfg = cfg.copy()
+    cfg.device = device
+    cfg.sensor.sample = None
+    seeds = [int(cfg.seed) + number for number in range(batch)]
+
+    def together() -> list[Any]:
+        return roll_out(cfg, observer, seeds)
+
+    def alone() -> list[Any]:
+        return [roll_out(cfg, observer, [seed])[0] for seed in seeds]
+
+    def check() -> None:
+        for ours, theirs in zip(together(), alone(), strict=True):
+            same("episode", ours.direction[:2], theirs.direction[:2], 1e-3)
+            same("episode", ours.global_information[0], theirs.global_information[0], 1e-3)
+
+    looks = whole(cfg, "saccades")
+    return Path(
+        "episode",
+        f"of {looks} saccades, {observer.retina.count} RFs, {cfg.memory.cells} cells; {batch} together",
+        device,
+        together,
+        (Peer("one by one", alone),),
+        check,
+        units=batch,
+    )
+
+
+def tuning_episode(cfg: DictConfig, observer: Observer) -> Path:
+    """Tuning's simulated episodes together, and the same one by one."""
+    episodes, cells = whole(cfg, "tuning.episodes", 8), whole(cfg, "tuning.cells", 2)
+    task = Task(observer, whole(cfg, "saccades", 2), number(cfg, "far_m"))
+    generator = torch.Generator().manual_seed(int(cfg.seed))
+    scenes = draw_scenes(Distribution(), observer.head, episodes, generator)
+    few = OmegaConf.merge(cfg, {"memory": {"cells": episodes * cells}})
+    assert isinstance(few, DictConfig)
+    directions = build_cells(few, observer.head, generator).reshape(episodes, cells, 3)
+    noise = torch.randn(task.saccades, episodes, cells, generator=generator)
+    world = world_of(task, scenes, directions, noise)
+    alpha = torch.ones(())
+    part = [torch.tensor([b]) for b in range(min(8, episodes))]
+    singles: list[tuple[Any, Worlds]] = [(scenes.take(one), world.take(one)) for one in part]
+
+    def alone() -> torch.Tensor:
+        return torch.cat([simulate(task, *single, alpha).value for single in singles])
+
+    def together() -> torch.Tensor:
+        return simulate(task, scenes, world, alpha).value
+
+    def check() -> None:
+        same("tune", together()[: len(part)], alone(), 1e-4, 0.99)
+
+    return Path(
+        "tune",
+        f"an episode of {task.saccades} saccades and {cells} cells; {episodes} together",
+        "cpu",
+        together,
+        (Peer(f"one by one, {len(part)} of them scaled", alone, episodes / len(part)),),
+        check,
+        units=episodes,
+    )

@@ -1,0 +1,1 @@
+"""`torchfovea calibrate`: is the claimed uncertainty true."""

@@ -1,0 +1,272 @@
+"""`torchfovea calibrate`: fit the error budget on some observations with truth, judge it on others."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, cast
+
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from torchfovea.commands.calibrate.report import bins, print_figures, regions_of, table
+from torchfovea.commands.calibrate.truths import Truths, look_at_pair, look_at_world
+from torchfovea.commands.shared.budgets import build_budget, made_for, write_budget
+from torchfovea.commands.shared.build import build_matcher, build_scene_of, build_sensor, choice, construct, whole
+from torchfovea.commands.shared.config import run_folder
+from torchfovea.commands.shared.pairs import gaze_of, load_pair, named_pair
+from torchfovea.commands.shared.progress import progress_bar
+from torchfovea.commands.shared.unread import refuse_unread
+from torchfovea.files import write_csv, write_result
+from torchfovea.sensing.correspondence import Budget
+from torchfovea.sensing.head import Gaze, Head, fixate
+from torchfovea.setting import SettingError, require
+from torchfovea.sim.scene import Scene
+from torchfovea.sim.world import World
+from torchfovea.stereo.matchers import Matcher
+from torchfovea.studies.calibration import Judged, concatenate, inlier_of, judge, select, sigma_of
+from torchfovea.studies.fitting import BudgetFit, Likelihood, fit_budget, least_match_px
+from torchfovea.studies.shared_errors import KnownLook, lasting_share_of, shared_share
+
+__all__ = ["random_gazes", "run"]
+
+QUICK = {"scenes": 2, "judged_scenes": 2, "looks": 2}
+FULL = {"scenes": 16, "judged_scenes": 16, "looks": 2}
+JUDGED_SEEDS = 1000  # scenes to judge on have seeds from here, so that none is fitted on
+SHARPEST_PX = 0.01  # a fit whose median σ of a disparity is below this has collapsed
+
+
+class Split(NamedTuple):
+    """Observations of one kind.
+
+    Attributes:
+        fitted: to fit on.
+        judged: to judge on; the same where every other scene judges it (`Split.left_out`).
+        looks: all of them.
+        scenes: the looks of each scene that was fitted on.
+        left_out: whether a budget fitted without it is judged too.
+    """
+
+    fitted: Judged
+    judged: Judged
+    looks: list[Truths]
+    scenes: list[list[Truths]]
+    left_out: bool = False
+
+
+def run(cfg: DictConfig) -> float:
+    """Calibrate; the mixture's negative log-likelihood of what was judged on is what a sweeper sees."""
+    refuse_unread("sensor.sample")
+    cfg = _sized(cfg)
+    scenes, judged_scenes = whole(cfg, "scenes", 0), whole(cfg, "judged_scenes")
+    looks, seed = whole(cfg, "looks"), whole(cfg, "seed", 0)
+    require(isinstance(cfg.real, bool), "real", cfg.real, "true or false")
+    require(OmegaConf.is_list(cfg.pairs), "pairs", cfg.pairs, "a list of motorcycle and folders")
+    require(scenes > 0 or cfg.real or len(cfg.pairs) > 0, "scenes", scenes, "at least 1, real=true or pairs")
+    budget = build_budget(cfg)
+    start = replace(budget, source_px=whole(cfg, "sensor.source_px", 16))
+    matcher, folder = build_matcher(cfg), run_folder()
+    likelihood = construct(Likelihood, cfg.fit, "fit")
+    edges = _edges(cfg, "range_edges_m"), _edges(cfg, "eccentricity_edges_deg")
+    angles = _edges(cfg, "fovs_deg", least=1) if len(cfg.fovs_deg) else [float(cfg.sensor.fov_deg)]
+    data: dict[str, Split] = {}
+    if scenes:
+        data["simulated"] = _simulate(cfg, start, matcher, scenes, judged_scenes, looks, seed, angles)
+    data |= _pairs(cfg, start, matcher)
+
+    def fit(*without: str) -> BudgetFit:
+        chosen = {name: split for name, split in data.items() if name not in without}
+        step = max(look.step_px for split in chosen.values() for look in split.looks)
+        return fit_budget([split.fitted for split in chosen.values()], start, likelihood, least_match_px(step))
+
+    found = fit()
+    models = {name: {"before": budget, "after": found.budget} for name in data}
+    if len(data) > 1:
+        for name, split in data.items():
+            if split.left_out:
+                models[name]["left_out"] = fit(name).budget
+    after = _sharing(found.budget, data)
+    models = {name: laws | {"after": after} for name, laws in models.items()}
+    figures: dict[str, Any] = {}
+    for kind, split in data.items():
+        prefix = "" if kind == next(iter(data)) else f"{kind}."
+        area = split.judged.area()
+        for model, law in models[kind].items():
+            claims = sigma_of(split.judged, law), inlier_of(split.judged, law)
+            for suffix, weight in (("", None), ("_by_area", area)):
+                for name, value in judge(split.judged, *claims, weight).items():
+                    figures[f"{prefix}{model}.{name}{suffix}"] = value
+            figures |= {f"{prefix}{model}.{k}": v for k, v in regions_of(split.judged, *claims).items()}
+        figures[f"{prefix}observations"] = split.judged.error.numel()
+        for k, suffix in enumerate(("", "_by_area")):
+            figures[f"{prefix}valid_fraction{suffix}"] = _mean([look.valid_share[k] for look in split.looks])
+            figures[f"{prefix}hidden_valid{suffix}"] = _mean([look.hidden_valid_share[k] for look in split.looks])
+    numbers = {name: value for name, value in asdict(after).items() if name != "source_px"}
+    figures |= {f"fit.{name}": value for name, value in numbers.items()}
+    figures |= {"fit.loss": found.loss, "fit.first_loss": found.first_loss}
+    write_csv(folder / "bins.csv", *bins({k: s.judged for k, s in data.items()}, models, *edges))
+    write_csv(folder / "reliability.csv", *table({k: s.judged for k, s in data.items()}, models))
+    from torchfovea.commands.calibrate.pictures import draw_calibration
+
+    draw_calibration(
+        folder / "calibration.png",
+        {kind: (s.judged, {m: sigma_of(s.judged, law) for m, law in models[kind].items()}) for kind, s in data.items()},
+    )
+    write_result(folder, figures)
+    print_figures(figures, {kind: list(laws) for kind, laws in models.items()})
+    _refuse(figures, data, models, after)
+    _write(folder / "budget" / "fitted.yaml", after, cfg, data, angles)
+    return float(figures["after.mixture_nll"])
+
+
+def random_gazes(scene: Scene, world: World, count: int, generator: torch.Generator) -> list[Gaze]:
+    """Gazes that fixate surfaces in random directions within reach."""
+    head, found = world.head, []
+    for _ in range(1000 * count):
+        pan = math.radians(head.pan_limit_deg) * (2 * torch.rand((), generator=generator, dtype=torch.float64) - 1)
+        span = math.radians(head.tilt_up_deg + head.tilt_down_deg)
+        tilt = span * torch.rand((), generator=generator, dtype=torch.float64) - math.radians(head.tilt_up_deg)
+        forward = torch.cos(tilt)
+        direction = torch.stack([forward * torch.cos(pan), forward * torch.sin(pan), -torch.sin(tilt)])
+        hit = world.panorama(direction[None])
+        gaze, reachable = fixate(head, direction * hit.range_m[0])
+        if bool(reachable) and int(hit.geom[0]) >= 0:
+            found.append(gaze)
+        if len(found) == count:
+            return found
+    raise SettingError(f"scene = {type(scene.params).__name__}: expected a scene with surfaces within reach")
+
+
+def _simulate(
+    cfg: DictConfig,
+    budget: Budget,
+    matcher: Matcher,
+    scenes: int,
+    judged_scenes: int,
+    looks: int,
+    seed: int,
+    angles: list[float],
+) -> Split:
+    """Random looks at simulated scenes, in turn at each field of view; those to judge on have seeds of their own."""
+    head = construct(Head, cfg.head, "head")
+    renderer = cast(Literal["rays", "gl"], choice(cfg, "renderer.name", ("rays", "gl")))
+    seeds = [seed + k for k in range(scenes)], [seed + JUDGED_SEEDS + k for k in range(judged_scenes)]
+    parts: tuple[list[list[Truths]], list[list[Truths]]] = ([], [])
+    with progress_bar() as p:
+        task = p.add_task("looks", total=(scenes + judged_scenes) * looks)
+        for part, those in zip(parts, seeds, strict=True):
+            for i, k in enumerate(those):
+                sized = cfg.copy()
+                sized.sensor.fov_deg = angles[i % len(angles)]
+                camera, retina = build_sensor(sized)
+                scene = build_scene_of(cfg, head, k)
+                world = World(
+                    scene, renderer=renderer, camera=camera, source_px=budget.source_px or 400,
+                    radius_px=retina.radius_px,
+                )  # fmt: skip
+                part.append([])
+                for gaze in random_gazes(scene, world, looks, torch.Generator().manual_seed(k)):
+                    part[-1].append(look_at_world(world, gaze, retina, budget, matcher))
+                    p.update(task, advance=1)
+    fitted, judged = (_known(concatenate([look.data for looks in part for look in looks])) for part in parts)
+    return Split(fitted, judged, [look for part in parts for looks in part for look in looks], parts[0])
+
+
+def _pairs(cfg: DictConfig, budget: Budget, matcher: Matcher) -> dict[str, Split]:
+    """Pairs with truth: a whole one is a scene; of the one that `real` names either half is."""
+    retina = build_sensor(cfg)[1]
+    found: dict[str, Split] = {}
+    for k, name in enumerate(cfg.pairs):
+        look = look_at_pair(named_pair(name, f"pairs[{k}]"), retina, None, budget, matcher)
+        data, title = _known(look.data), Path(str(name)).name
+        require(title not in (*found, "simulated", "real", "real_left"), f"pairs[{k}]", name, "a name of its own")
+        found[title] = Split(data, data, [look], [], left_out=True)
+    if cfg.real:
+        pair = load_pair(cfg)
+        look = look_at_pair(pair, retina, gaze_of(cfg, pair), budget, matcher)
+        column = look.data.place_px[:, 0]
+        # the retina looks at the picture's middle, or at the gaze
+        left, right = (_known(select(look.data, half)) for half in (column < 0, column >= 0))
+        found["real"] = Split(left, right, [look], [])
+        if cfg.pairs:
+            found["real"] = Split(right, right, [look], [], left_out=True)
+            found["real_left"] = Split(left, left, [look], [], left_out=True)
+    return found
+
+
+def _sharing(budget: Budget, data: dict[str, Split]) -> Budget:
+    """The budget with what errors have in common, where the looks tell."""
+    shared = shared_share([look.data for split in data.values() for look in split.looks], budget)
+    sights = [
+        [KnownLook(t.data, t.point_m, t.axis) for t in looks] for split in data.values() for looks in split.scenes
+    ]
+    lasting = lasting_share_of(sights, budget)
+    if shared is not None:
+        share, factor = shared
+        px, widths = (factor * length for length in (budget.shared_px, budget.shared_widths))
+        budget = replace(budget, shared=share, shared_px=px, shared_widths=widths, lasting=min(budget.lasting, share))
+    return budget if lasting is None else replace(budget, lasting=min(lasting, budget.shared))
+
+
+def _refuse(figures: dict[str, Any], data: dict[str, Split], models: dict[str, dict[str, Budget]], law: Budget) -> None:
+    """Refuse a fit that is worse than before on what it did not see, or whose σ collapses."""
+    for kind in data:
+        prefix = "" if kind == next(iter(data)) else f"{kind}."
+        model = "left_out" if "left_out" in models[kind] else "after"
+        then, now = (figures[f"{prefix}{m}.mixture_nll_by_area"] for m in ("before", model))
+        good = now <= then
+        require(good, f"fit: {kind}, {model}, mixture_nll_by_area", f"{now:.3f}", f"at most {then:.3f}, as before")
+    for split in data.values():
+        sharp = sigma_of(split.fitted, law) / (split.fitted.right_gain * split.fitted.pixel_px)
+        median = float(sharp.median())
+        require(median > SHARPEST_PX, "fit: median σ", f"{median:.2g} px", f"more than {SHARPEST_PX} source pixels")
+
+
+def _write(path: Path, law: Budget, cfg: DictConfig, data: dict[str, Split], angles: list[float]) -> None:
+    """The fitted budget as a file of the group `budget`."""
+    simulated = [f"{cfg.scenes} scenes {cfg.scene.name}, {cfg.looks} looks each"] if cfg.scenes else []
+    pairs = [name.replace("real_left", "its other half").replace("real", "half a pair") for name in data]
+    command = " ".join(HydraConfig.get().overrides.task)
+    comments = [
+        "Fitted by torchfovea calibrate; torchfovea.sensing.correspondence.Budget says what the numbers are.",
+        f"Command: torchfovea calibrate {command}",
+        f"Fitted on: {', '.join(simulated + [name for name in pairs if name != 'simulated'])}",
+    ]
+    sizes = [cfg.sensor.source_px] if cfg.scenes else []
+    sizes += [
+        round(2 * cfg.sensor.radius_px / float(s.judged.pixel_px[0])) for k, s in data.items() if k != "simulated"
+    ]
+    write_budget(path, law, comments, cfg.budget.sigma_points, made_for(cfg, angles if cfg.scenes else [], sizes))
+
+
+def _known(data: Judged) -> Judged:
+    count = data.error.numel()
+    require(count >= 100, "observations with truth", count, "at least 100 valid receptive fields whose truth is known")
+    return data
+
+
+def _mean(values: list[float]) -> float:
+    known = [v for v in values if math.isfinite(v)]
+    return sum(known) / len(known) if known else math.nan
+
+
+def _edges(cfg: DictConfig, setting: str, least: int = 2) -> list[float]:
+    values = OmegaConf.select(cfg, setting)
+    good = OmegaConf.is_list(values) and len(values) >= least
+    good = good and all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
+    count = {1: "ascending numbers", 2: "two or more ascending numbers"}[least]
+    require(good and all(a < b for a, b in pairwise(values)), setting, values, count)
+    return [float(v) for v in values]
+
+
+def _sized(cfg: DictConfig) -> DictConfig:
+    """The configuration with the profile's sizes where a setting is null."""
+    sizes = QUICK if HydraConfig.get().runtime.choices.get("profile") == "quick" else FULL
+    cfg = cfg.copy()
+    for setting, value in sizes.items():
+        if OmegaConf.select(cfg, setting) is None:
+            OmegaConf.update(cfg, setting, value)
+    return cfg

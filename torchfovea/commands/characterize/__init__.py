@@ -1,0 +1,1 @@
+"""`torchfovea characterize`: the sensor's precision."""

@@ -1,0 +1,1 @@
+"""`torchfovea memory`: the memory's studies."""

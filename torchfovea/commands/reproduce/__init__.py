@@ -1,0 +1,1 @@
+"""`torchfovea reproduce`: the paper's claims."""

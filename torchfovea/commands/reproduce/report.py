@@ -1,0 +1,193 @@
+"""The report of a reproduction: one HTML file, claims first, pictures inside."""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchfovea import __version__
+from torchfovea.commands.reproduce import pictures
+from torchfovea.commands.reproduce.claims import rows_where
+from torchfovea.files import replacing, write_csv
+from torchfovea.studies.significance import bootstrap_interval
+
+__all__ = ["write_report"]
+
+Row = dict[str, Any]
+
+STYLE = """body{font:15px/1.45 system-ui,sans-serif;max-width:75em;margin:2em auto;padding:0 1em;color:#222}
+table{border-collapse:collapse;width:100%;font-size:14px}th,td{text-align:left;vertical-align:top;padding:.35em .6em;
+border-bottom:1px solid #ddd}td.n{text-align:right;white-space:nowrap}.holds{color:#176b2c;font-weight:600}
+.fails{color:#a31515;font-weight:600}.undecided{color:#7a6200;font-weight:600}small{color:#555}img{max-width:100%}
+code{background:#f2f2f2;padding:0 .25em}"""
+
+
+def write_report(folder: Path, plain: Row, rows: list[Row], stated: list[Row], figures: Row, fig5: Row) -> None:
+    """Draw the figures, tabulate the ablation, and write report.html.
+
+    Args:
+        folder: the run's.
+        plain: its settings.
+        rows: its episodes.
+        stated: its claims with their verdicts, as in claims.json.
+        figures: as in result.json.
+        fig5: the curves of `torchfovea.commands.reproduce.fig5`.
+    """
+    sections: list[tuple[str, list[Path], str]] = []
+    pictures.draw_vergences(folder / "fig5.png", fig5)
+    sections.append(("Fig. 5: what a sensor knows of a plane", [folder / "fig5.png"], ""))
+    sections += _fig8(folder, plain, rows) + _fig9(folder, plain, rows)
+    sections += _ablation(folder, rows, plain["level"])
+    sections += _photometric(rows, plain["level"])
+    parts = [
+        f"<!doctype html><html lang=en><meta charset=utf-8><title>torchfovea reproduce</title><style>{STYLE}</style>",
+        "<h1>Foveal mechanisms in active stereo: the claims, measured again</h1>",
+        f"<p>torchfovea {__version__}; {figures['scenes']} scenes, "
+        f"{figures['episodes']} episodes of {plain['saccades']} saccades, {plain['memory']['cells']} cells, "
+        f"{plain['sensor']['sample'] or plain['sensor']['receptive_fields']} receptive fields a look. "
+        f"What counts was fixed before the run: scene "
+        f"{plain['counts']['scene']}, reading {plain['counts']['reading']}. "
+        "The scene is the unit of statistics; differences are paired over scenes; intervals are bootstrapped (BCa); "
+        f"verdicts are two-sided at {1 - plain['level']:.0%} after Holm's correction over the claims of Sec. 7.2. "
+        "In attention_world all scenes are one place, and only the noise and the memory's cells differ.</p>",
+        _claims_table(stated),
+    ]
+    for title, drawn, text in sections:
+        parts.append(f"<h2>{html.escape(title)}</h2>{text}")
+        parts += [_inline(picture) for picture in drawn]
+    parts.append("</html>")
+    with replacing(folder / "report.html") as temporary:
+        temporary.write_text("\n".join(parts), encoding="utf-8")
+
+
+def _inline(picture: Path) -> str:
+    data = base64.b64encode(picture.read_bytes()).decode()
+    return f'<p><img alt="{html.escape(picture.stem)}" src="data:image/png;base64,{data}"></p>'
+
+
+def _number(value: Any) -> str:
+    return "–" if value is None else f"{value:.3g}"
+
+
+def _claims_table(stated: list[Row]) -> str:
+    lines = ["<h2>Claims</h2><table><tr><th>claim<th>verdict<th>estimate, 95% CI<th>effect size<th>p (Holm)<th>n"]
+    for entry in stated:
+        interval = "" if entry["ci_low"] is None else f"<br>{_number(entry['ci_low'])} to {_number(entry['ci_high'])}"
+        places = [f"{place}: {verdict}" for place, verdict in entry.get("elsewhere", {}).items() if verdict]
+        other = f"<br><small>elsewhere: {html.escape('; '.join(places))}</small>" if places else ""
+        lines.append(
+            f"<tr><td>{html.escape(entry['text'])} <small>(Sec. {entry['section']}, {entry['id']})</small>"
+            f"<br><small>{html.escape(entry['definition'])}</small>{other}"
+            f"<td class={entry['verdict']}>{entry['verdict']}<td class=n>{_number(entry['estimate'])}{interval}"
+            f"<td class=n>{_number(entry['effect_size'])}<td class=n>{_number(entry['p_holm'])}<td class=n>{entry['n']}"
+        )
+    return "\n".join([*lines, "</table>"])
+
+
+def _fig8(folder: Path, plain: Row, rows: list[Row]) -> list[tuple[str, list[Path], str]]:
+    sections = []
+    for condition in plain["fig8"]["conditions"]:
+        own = rows_where(rows, {"fig": 8, **condition})
+        if not own:
+            continue
+        name, words = f"{condition['scene']}_{condition['reading']}", f"{condition['scene']}, {condition['reading']}"
+        arms, course = folder / f"fig8a_{name}.png", folder / f"fig8b_{name}.png"
+        pictures.draw_arms(arms, own, f"Fig. 8a, {words}: mean over scenes with 95% CI")
+        groups = {
+            f"{sensor.replace('_', '-')}, {fov}°": (
+                colour, rows_where(own, {"sensor": sensor, "fov_deg": fov, "arm": "ucb_100"})
+            )
+            for (sensor, fov), colour in pictures.COLOURS.items()
+        }  # fmt: skip
+        pictures.draw_course(course, groups, f"Fig. 8b, {words}: α = 100")
+        sections.append((f"Fig. 8: {words}", [arms, course], ""))
+    return sections
+
+
+def _fig9(folder: Path, plain: Row, rows: list[Row]) -> list[tuple[str, list[Path], str]]:
+    sections = []
+    for condition in plain["fig9"]["conditions"]:
+        own = rows_where(rows, {"fig": 9, **condition})
+        for arm in dict.fromkeys(row["arm"] for row in own):
+            part = rows_where(own, {"arm": arm})
+            words = f"{condition['scene']}, {condition['reading']}, α = {arm.removeprefix('ucb_')}"
+            name = f"{condition['scene']}_{condition['reading']}_{arm}"
+            bars, course = folder / f"fig9a_{name}.png", folder / f"fig9b_{name}.png"
+            pictures.draw_biases(bars, part, f"Fig. 9a, {words}: mean over scenes with 95% CI")
+            groups = {
+                bias: (colour, rows_where(part, {"bias": bias}))
+                for bias, colour in pictures.BIASES.items()
+                if bias != "aimed"
+            }
+            pictures.draw_course(course, groups, f"Fig. 9b, {words}")
+            sections.append((f"Fig. 9: {words}", [bars, course], ""))
+    return sections
+
+
+def _difference(
+    rows: Sequence[Mapping[str, Any]], base: Sequence[Mapping[str, Any]], metric: str, level: float
+) -> tuple[float, float, float]:
+    then = {row["seed"]: row[metric] for row in base if row[metric] is not None}
+    pairs = [row[metric] - then[row["seed"]] for row in rows if row[metric] is not None and row["seed"] in then]
+    values = torch.tensor(pairs, dtype=torch.float64)
+    found = bootstrap_interval(values, torch.Generator().manual_seed(0), level)
+    return float(found.estimate), float(found.low), float(found.high)
+
+
+def _ablation(folder: Path, rows: list[Row], level: float) -> list[tuple[str, list[Path], str]]:
+    own = rows_where(rows, {"fig": "ablation"})
+    if not own:
+        return []
+    base = rows_where(own, {"variant": "as it is"})
+    columns = ("gap_per_saccade", "saccades_to_target", "found", "target_error_m", "local_information_per_saccade")
+    lines, drawn, table = [], [], []
+    for variant in dict.fromkeys(row["variant"] for row in own):
+        part = rows_where(own, {"variant": variant})
+        cells: list[Any] = [variant]
+        for metric in columns:
+            known = [row[metric] for row in part if row[metric] is not None]
+            cells.append(sum(known) / len(known) if known else None)
+        gain = None
+        if variant != "as it is":
+            gain = _difference(part, base, "gap_per_saccade", level)
+            drawn.append((variant, *gain))
+        table.append((*cells, *(gain or (None, None, None))))
+        change = "" if gain is None else f"{gain[0]:+.3f} ({gain[1]:+.3f} to {gain[2]:+.3f})"
+        lines.append(
+            f"<tr><td>{html.escape(variant)}"
+            + "".join(f"<td class=n>{_number(value)}" for value in cells[1:])
+            + f"<td class=n>{change}"
+        )
+    head = "".join(f"<th>{name.replace('_', ' ')}" for name in columns)
+    text = f"<table><tr><th>change{head}<th>gap, change with 95% CI{''.join(lines)}</table>"
+    names = ("variant", *columns, "gap_change", "gap_change_low", "gap_change_high")
+    write_csv(folder / "ablation.csv", names, table)
+    picture = folder / "ablation.png"
+    pictures.draw_ablation(picture, drawn)
+    return [("What decides the outcome", [picture], text)]
+
+
+def _photometric(rows: list[Row], level: float) -> list[tuple[str, list[Path], str]]:
+    own = rows_where(rows, {"fig": "photometric"})
+    if not own:
+        return []
+    columns = ("gap_per_saccade", "saccades_to_target", "found", "target_error_m", "regret_per_saccade")
+    lines = []
+    for sensor in dict.fromkeys(row["sensor"] for row in own):
+        part = rows_where(own, {"sensor": sensor})
+        cells = []
+        for metric in columns:
+            known = torch.tensor([float(row[metric]) for row in part if row[metric] is not None], dtype=torch.float64)
+            if len(known) < 2:
+                cells.append("–")
+                continue
+            found = bootstrap_interval(known, torch.Generator().manual_seed(0), level)
+            cells.append(f"{float(found.estimate):.3g} ({float(found.low):.3g} to {float(found.high):.3g})")
+        lines.append(f"<tr><td>{sensor}" + "".join(f"<td class=n>{cell}" for cell in cells))
+    head = "".join(f"<th>{name.replace('_', ' ')}" for name in columns)
+    return [("Photometric: images, matched", [], f"<table><tr><th>sensor{head}{''.join(lines)}</table>")]

@@ -1,0 +1,1 @@
+"""`torchfovea search`: visual searches."""

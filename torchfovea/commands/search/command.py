@@ -1,0 +1,187 @@
+"""`torchfovea search`: visual-search episodes, their figures, tables and a picture (paper Sec. 7.2)."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+from rich.table import Table
+
+from torchfovea.commands.shared.build import build_match, build_motor, build_observer, build_renderer, name_of
+from torchfovea.commands.shared.config import run_folder
+from torchfovea.commands.shared.manifest import complete, finished
+from torchfovea.commands.shared.memories import loaded_memory, memory_path
+from torchfovea.commands.shared.parallel import spread, workers_of
+from torchfovea.commands.shared.progress import progress_bar
+from torchfovea.commands.shared.rollout import batched, device_of, one_episode, roll_out, sample_of
+from torchfovea.commands.shared.settings import choice, number, whole
+from torchfovea.commands.shared.strategy import build_stop, build_strategy
+from torchfovea.episode import Episode
+from torchfovea.files import write_csv
+from torchfovea.memory.store import save_memory
+from torchfovea.metrics import phantom
+from torchfovea.perception import Observer, Step
+from torchfovea.search import Look
+from torchfovea.setting import require
+
+__all__ = ["EPISODE_COLUMNS", "SACCADE_COLUMNS", "episode_row", "run", "saccade_rows", "summarize"]
+
+EPISODE_COLUMNS = (
+    "episode", "seed", "gap_final", "gap_per_saccade", "regret_per_saccade", "global_information_per_saccade",
+    "local_information_per_saccade", "saccades_to_target", "found", "target_error_m", "degrees_travelled",
+    "motor_seconds", "seconds_per_saccade", "phantom_share",
+)  # fmt: skip
+SACCADE_COLUMNS = (
+    "episode", "saccade", "pan_rad", "tilt_rad", "vergence_rad", "range_m", "reward", "gap", "regret",
+    "global_information", "local_information", "aimed_m", "phantom",
+)  # fmt: skip
+
+
+def run(cfg: DictConfig) -> float:
+    """Run the episodes of a configuration; the mean gap per saccade is what a sweeper sees."""
+    episodes, saccades, seed = whole(cfg, "episodes"), whole(cfg, "saccades"), whole(cfg, "seed", 0)
+    observer, folder = build_observer(cfg), run_folder()
+    choice(cfg, "fidelity", ("photometric", "geometric"))
+    build_renderer(cfg) if cfg.fidelity == "photometric" else name_of(cfg, "renderer")
+    device_of(cfg), sample_of(cfg), whole(cfg, "batch"), workers_of(cfg), number(cfg, "far_m")
+    number(cfg, "near_target_m"), build_stop(cfg)
+    require(isinstance(cfg.picture, bool), "picture", cfg.picture, "true or false")
+    # mistakes come first, also in what is not used
+    build_strategy(cfg, observer), build_match(cfg), build_motor(cfg), loaded_memory(cfg, observer)
+    saved = memory_path(cfg, "memory.save")
+    done = finished(cfg, folder)
+    if done is not None:
+        return done
+    rows: list[tuple[Any, ...]] = []
+    steps: list[tuple[Any, ...]] = []
+    last: Episode | None = None
+    with progress_bar() as progress:
+        task = progress.add_task("search", total=episodes * saccades)
+
+        def advance(count: int) -> None:
+            progress.update(task, advance=count)
+
+        for k, row, course, episode in _episodes(cfg, observer, [seed + k for k in range(episodes)], advance):
+            last = episode
+            rows.append((k, seed + k, *row))
+            steps.extend((k, *line) for line in course)
+    write_csv(folder / "episodes.csv", EPISODE_COLUMNS, rows)
+    write_csv(folder / "saccades.csv", SACCADE_COLUMNS, steps)
+    assert last is not None
+    if cfg.picture:
+        _draw(folder, cfg, observer.retina, last, rows[-1])
+    if saved is not None:
+        save_memory(saved, last.step.memory)
+    figures = summarize(rows)
+    complete(folder, figures)
+    _print(figures)
+    return float(figures["gap_per_saccade"])
+
+
+Outcome = tuple[int, tuple[Any, ...], list[tuple[Any, ...]], Episode | None]
+
+
+def _episodes(
+    cfg: DictConfig, observer: Observer, seeds: list[int], advance: Callable[[int], None]
+) -> Iterator[Outcome]:
+    """Number, figures and course of every episode in order; the last one's episode itself besides."""
+    (workers, backend), final = workers_of(cfg), len(seeds) - 1
+    if batched(cfg):
+        size = whole(cfg, "batch")
+        for start in range(0, len(seeds), size):
+            part = seeds[start : start + size]
+            together = roll_out(cfg, observer, part, each=_each(advance, len(part)))
+            for k, episode in enumerate(together, start):
+                yield k, episode_row(episode), saccade_rows(episode), episode if k == final else None
+        return
+    if workers == 1 or final == 0:
+        for k, seed in enumerate(seeds):
+            episode = one_episode(cfg, observer, seed, _each(advance, 1))
+            yield k, episode_row(episode), saccade_rows(episode), episode if k == final else None
+        return
+    settings = OmegaConf.to_yaml(OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"]), resolve=True)
+    outcomes: dict[int, Outcome] = {}
+    work = [(settings, k, seed, k == final) for k, seed in enumerate(seeds)]
+    for k, outcome in spread(_elsewhere, work, workers, backend):
+        if isinstance(outcome, Exception):
+            raise outcome
+        advance(whole(cfg, "saccades"))
+        outcomes[k] = outcome
+    yield from (outcomes[k] for k in range(len(seeds)))
+
+
+def _each(advance: Callable[[int], None], count: int) -> Callable[[int, Look, Step], None]:
+    """What an episode calls after every decision: so many saccades are done."""
+    return lambda t, look, step: advance(count)
+
+
+def _elsewhere(work: tuple[str, int, int, bool]) -> Outcome:
+    """An episode in a process of its own: its settings, number and seed, and whether it comes back whole."""
+    settings, k, seed, kept = work
+    cfg = OmegaConf.create(settings)
+    assert isinstance(cfg, DictConfig)
+    episode = one_episode(cfg, build_observer(cfg), seed)
+    return k, episode_row(episode), saccade_rows(episode), episode if kept else None
+
+
+def episode_row(episode: Episode) -> tuple[Any, ...]:
+    """An episode's figures, in the order of EPISODE_COLUMNS from gap_final on."""
+    local = episode.local_information
+    chosen = phantom(episode.aimed_m, episode.range_m)[1 : episode.looks]  # the first gaze is nobody's choice
+    return (
+        float(episode.gap[-1]), float(episode.gap.mean()), float(episode.regret.mean()),
+        float(episode.global_information.mean()), None if local is None else float(local.mean()),
+        episode.moves, int(episode.hit.any()), episode.target_error_m, episode.degrees, episode.motor_seconds,
+        episode.compute_seconds, float(chosen.double().mean()) if len(chosen) else None,
+    )  # fmt: skip
+
+
+def saccade_rows(episode: Episode) -> list[tuple[Any, ...]]:
+    """An episode's course, in the order of SACCADE_COLUMNS from saccade (counted from 1) on."""
+    local = episode.local_information
+    columns = (*episode.gaze, episode.range_m, episode.reward, episode.gap, episode.regret, episode.global_information)
+    aims, nothing = episode.aimed_m, phantom(episode.aimed_m, episode.range_m)
+    return [
+        (
+            t + 1, *(float(c[t]) for c in columns), None if local is None else float(local[t]), float(aims[t]),
+            int(nothing[t]),
+        )
+        for t in range(len(episode.gap))
+    ]  # fmt: skip
+
+
+def summarize(rows: list[tuple[Any, ...]]) -> dict[str, Any]:
+    """Means over the episodes; a figure that some episode lacks is averaged over those that have it."""
+    figures: dict[str, Any] = {}
+    for name, values in zip(EPISODE_COLUMNS[2:], list(zip(*rows, strict=True))[2:], strict=True):
+        known = [v for v in values if v is not None]
+        figures[name] = statistics.fmean(known) if known else None
+    figures["saccades_to_target_median"] = statistics.median(
+        row[EPISODE_COLUMNS.index("saccades_to_target")] for row in rows
+    )
+    figures["episodes"] = len(rows)
+    return figures
+
+
+def _draw(folder: Path, cfg: DictConfig, retina: Any, episode: Episode, row: tuple[Any, ...]) -> None:
+    from torchfovea.commands.search.pictures import draw_episode
+
+    moves = row[EPISODE_COLUMNS.index("saccades_to_target")]
+    outcome = f"target fixated after {moves} saccades" if bool(episode.hit.any()) else "target not found"
+    draw_episode(
+        folder / "episode.png",
+        episode,
+        retina,
+        f"{cfg.scene.name}, {cfg.sensor.layout}, {cfg.sensor.fov_deg:g}°: {outcome}",
+    )
+
+
+def _print(figures: dict[str, Any]) -> None:
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    for name, value in figures.items():
+        table.add_row(name, "-" if value is None else f"{value:.4g}")
+    Console().print(table)

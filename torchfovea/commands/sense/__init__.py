@@ -1,0 +1,1 @@
+"""`torchfovea sense`: a pair of images."""

@@ -1,0 +1,154 @@
+"""`torchfovea sense`: a rectified stereo pair to 3-D points with covariances, judged where the truth is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from torchfovea.commands.sense.report import beside, match_figures, read_at_fields
+from torchfovea.commands.shared.budgets import build_budget
+from torchfovea.commands.shared.build import build_match, build_sensor, choice, name_of
+from torchfovea.commands.shared.config import run_folder
+from torchfovea.commands.shared.images import write_ply
+from torchfovea.commands.shared.pairs import gaze_of, load_pair
+from torchfovea.commands.shared.unread import refuse_unread
+from torchfovea.files import replacing, write_result
+from torchfovea.gaussian import Gaussian, columns
+from torchfovea.sensing.chart import cartesian_from_inverse_range
+from torchfovea.sensing.correspondence import Budget, Correspondences
+from torchfovea.sensing.head import Eyes
+from torchfovea.sensing.kinship import once_a_pixel
+from torchfovea.sensing.layout import Retina
+from torchfovea.sensing.triangulation import Observations, observe
+from torchfovea.sensing.unscented import SigmaPoints
+from torchfovea.setting import SettingError, require
+from torchfovea.stereo.matchers import Match, Matcher, checked_matches
+from torchfovea.stereo.matching import match_sgbm
+from torchfovea.stereo.sgbm import SGBM
+from torchfovea.stereo.views import Views
+from torchfovea.studies.calibration import mixture_std
+
+__all__ = ["Sensed", "run", "sense"]
+
+
+class Sensed(NamedTuple):
+    """Points of a pair, in the left camera's optical frame (x right, y down, z forward).
+
+    Attributes:
+        matches: the correspondences.
+        observed: in the inverse-range chart about the left camera.
+        points: Cartesian moments, (N, 3) [m] and (N, 6) [m²].
+        colour: what each receptive field sees, (N, 3).
+        chosen: bool (N,), the valid fields of which none copies another's source pixel.
+    """
+
+    matches: Correspondences
+    observed: Observations
+    points: Gaussian
+    colour: Tensor
+    chosen: Tensor
+
+
+def run(cfg: DictConfig) -> float | None:
+    """Sense a pair; the median depth error is what a sweeper sees, if there is truth."""
+    refuse_unread("sensor.fov_deg", "sensor.camera", "sensor.sample")
+    every = name_of(cfg, "sensor", "layout") == "every_pixel"
+    retina = None if every else build_sensor(cfg)[1]  # the field of view is the images' own
+    match, pair, folder = build_match(cfg), load_pair(cfg), run_folder()
+    views, budget = pair.views(gaze_of(cfg, pair)), build_budget(cfg, pair=True)
+    printed = choice(cfg, "budget.sigma_points", ("ours", "paper")) == "paper"
+
+    matches, found = _matched(match, views, retina, budget)
+    sensed = sense(views, retina, matches, SigmaPoints.paper() if printed else None, not printed)
+    _write(folder, sensed)
+    observed, points = sensed.observed, sensed.points
+    figures: dict[str, Any] = match_figures(pair, views, retina, matches.left_px, observed, points, sensed.chosen)
+    # from here on nothing can lose the points
+    refused: SettingError | None = None
+    if pair.disparity is not None and retina is not None:
+        try:
+            ours = match if isinstance(match, Matcher) else Matcher(SGBM())
+            params = ours.params if isinstance(ours.params, SGBM) else SGBM()
+            _, plain = match_sgbm(views, None, params, budget, ours.nearest_m)
+            again = read_at_fields(plain.disparity, views, retina, plain.valid)
+            figures |= beside(pair, views, retina, observed, points, again)
+        except SettingError as error:
+            refused = error
+    from torchfovea.commands.sense.pictures import draw_sense
+
+    draw_sense(folder / "sense.png", pair.left, found, retina, observed, matches.left_px)
+    write_result(folder, figures)
+    grid = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    for name, value in figures.items():
+        grid.add_row(name, f"{value:.4g}")
+    Console().print(grid)
+    if refused is not None:
+        Console(stderr=True).print(f"sense: not judged beside plain matching: {refused}", highlight=False, markup=False)
+    return figures.get("median_error_m")
+
+
+def _matched(match: Match, views: Views, retina: Retina | None, budget: Budget) -> tuple[Correspondences, Any]:
+    """Match, with a user's own matcher too."""
+    if retina is None:
+        require(isinstance(match, Matcher), "sensor.layout", "every_pixel", "a retina, for a matcher of your own")
+        assert isinstance(match, Matcher)
+        return match(views, None, budget)
+    return checked_matches(match(views, retina, budget), retina)
+
+
+def sense(
+    views: Views, retina: Retina | None, matches: Correspondences, points: SigmaPoints | None, rotated: bool
+) -> Sensed:
+    """Correspondences of a rectified pair as points with covariances, in the left camera's frame."""
+    eye = torch.eye(3)
+    rig = Eyes(eye, torch.zeros(3), eye, torch.tensor([views.rig.baseline_m, 0.0, 0.0]))
+    px, cameras = matches.left_px, views.cameras(retina)
+    support = torch.full_like(px[..., 0], 0.5) if retina is None else retina.width_px(px) / 2
+    observed = _doubted(observe(matches, rig, cameras, support, points, "inverse_range", rotated))
+    moments = cartesian_from_inverse_range(Gaussian(observed.mean, observed.cov), observed.direction)
+    if retina is None:
+        colour, chosen = views.left.flatten(1).T, observed.valid
+    else:
+        colour = views.fovea(views.left[None], retina)[0].T
+        chosen = once_a_pixel(px, 1 / views.scale(retina), observed.valid)
+    return Sensed(matches, observed, moments, colour, chosen)
+
+
+def _doubted(observed: Observations) -> Observations:
+    """Observations whose inverse ranges are as uncertain as they are, a doubtful match taken in (`mixture_std`)."""
+    rho, valid = observed.mean[:, 2], observed.valid
+    if observed.inlier is None or int(valid.sum()) < 2:
+        return observed
+    *rest, variance = observed.cov.unbind(-1)
+    sigma = variance.sqrt()
+    factor = torch.where(valid, mixture_std(sigma, observed.inlier, rho[valid].std()) / sigma, 1.0)
+    aa, ab, ar, bb, br = rest
+    return observed._replace(cov=columns(aa, ab, factor * ar, bb, factor * br, factor.square() * variance))
+
+
+def _write(folder: Path, sensed: Sensed) -> None:
+    """points.ply and points.npz: the valid points alone, one a source pixel."""
+    keep = sensed.chosen
+    mean, cov, colour = (t[keep].numpy() for t in (sensed.points.mean, sensed.points.cov, sensed.colour))
+    inlier = sensed.observed.inlier
+    inlier = torch.ones_like(sensed.observed.mean[:, 2]) if inlier is None else inlier
+    write_ply(folder / "points.ply", mean, cov, colour, inlier[keep].numpy())
+    with replacing(folder / "points.npz") as path:
+        np.savez_compressed(
+            path,
+            mean_m=mean,
+            cov_m2=cov,
+            colour=colour,
+            inlier=inlier[keep].numpy(),
+            left_px=sensed.matches.left_px[keep].numpy(),
+            direction=sensed.observed.direction[keep].numpy(),
+            inverse_range=sensed.observed.mean[keep, 2].numpy(),
+            inverse_range_std=sensed.observed.cov[keep, 5].sqrt().numpy(),
+        )

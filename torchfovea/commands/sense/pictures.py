@@ -1,0 +1,64 @@
+"""The picture of a sensed pair."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchfovea.commands.shared.pictures import found_map
+from torchfovea.files import write_figure
+from torchfovea.sensing.correspondence import Disparity
+from torchfovea.sensing.layout import Retina
+from torchfovea.sensing.triangulation import Observations
+from torchfovea.stereo.sweep import SweepRange
+
+matplotlib.use("Agg")
+from matplotlib.figure import Figure
+
+__all__ = ["draw_sense"]
+
+
+def draw_sense(path: Path, left: Tensor, found: Any, retina: Retina | None, observed: Observations, px: Tensor) -> None:
+    """Draw a sensed pair: the left image, what the matcher found, each point's range and its relative uncertainty.
+
+    Args:
+        path: the PNG to write.
+        left: (3, H, W).
+        found: a `Disparity`, a `SweepRange`, or what is not drawn.
+        retina: of a `SweepRange`.
+        observed: in inverse range.
+        px: the receptive fields, (N, 2), for the two maps.
+    """
+    figure = Figure(figsize=(17, 9.5), layout="constrained")
+    axes = figure.subplots(2, 2)
+    axes[0, 0].imshow(np.asarray(left.movedim(0, -1)).clip(0, 1))
+    axes[0, 0].set_title("left image")
+    if isinstance(found, Disparity | SweepRange):
+        values, name = found_map(found, retina, min(left.shape[-2:]))
+        figure.colorbar(axes[0, 1].imshow(values, cmap="viridis"), ax=axes[0, 1])
+        axes[0, 1].set_title(name)
+    keep = observed.valid & (observed.mean[:, 2] > 0)
+    rho, sigma = observed.mean[keep, 2], observed.cov[keep, 5].sqrt()
+    maps = (
+        (1 / rho, "range", "m", "viridis_r", False),
+        (sigma / rho, "standard deviation of the inverse range over itself", "", "magma", True),
+    )
+    for place, (value, name, unit, cmap, log) in zip(axes[1], maps, strict=True):
+        low, high = (
+            (float(q) for q in torch.quantile(value.double(), torch.tensor([0.02, 0.98], dtype=torch.float64)))
+            if len(value)
+            else (0.1, 1.0)
+        )
+        drawn = place.scatter(
+            *px[keep].T, c=value, s=1.5, cmap=cmap, linewidths=0, norm="log" if log else None, rasterized=True
+        )
+        drawn.set_clim(low, max(high, low * 1.001 + 1e-9))
+        place.set(title=name, aspect="equal", facecolor="0.9")
+        place.invert_yaxis()
+        figure.colorbar(drawn, ax=place, label=unit)
+    write_figure(path, figure, dpi=80)

@@ -1,0 +1,1 @@
+"""What several commands share: from settings to objects, run folders, workers, words for mistakes."""

@@ -1,0 +1,51 @@
+"""The reward that a configuration describes: near is good, near to a point is, or whatever a user's function says."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+from torch import Tensor
+
+from torchfovea.commands.shared.named import build_named, name_of
+from torchfovea.deciding import reward
+from torchfovea.setting import require
+
+__all__ = ["build_reward", "nearest_to"]
+
+FORM = "a function of points (..., 3) [m] that returns a reward (...) for each"
+
+
+def nearest_to(point: Any) -> Callable[[Tensor], Tensor]:
+    """The reward r(x) = −‖x − point‖ [m].
+
+    Args:
+        point: [x, y, z] in the ego frame E [m].
+
+    Raises:
+        SettingError: for anything else.
+    """
+    three = isinstance(point, list | tuple) and len(point) == 3
+    numbers = three and all(isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in point)
+    require(
+        numbers, "reward.point", point, "[x, y, z] in metres: ahead, to the left and up from the ego frame's origin"
+    )
+    where = torch.tensor([float(v) for v in point], dtype=torch.float64)
+    return lambda x: reward.nearest_to(where.to(x))(x)
+
+
+def build_reward(cfg: DictConfig) -> Any:
+    """The group `reward`: the name of a measure of nearness, or a function of points, as `Observer.reward` takes them.
+
+    Raises:
+        SettingError: for an unknown name, or what is no function.
+    """
+    name = name_of(cfg, "reward")
+    if name in ("inverse_range", "range"):
+        return name
+    made: Callable[[Tensor], Tensor] = build_named(cfg, "reward", FORM)
+    require(callable(made), "reward", type(made).__name__, FORM)
+    return made

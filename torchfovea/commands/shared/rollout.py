@@ -1,0 +1,159 @@
+"""Episodes of a configuration: one by one, or many at once by the geometric sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+
+from torchfovea.arena import Truth, stack
+from torchfovea.commands.shared.build import build_arena, build_cells, build_motor, build_scene_of, name_of
+from torchfovea.commands.shared.memories import loaded_memory
+from torchfovea.commands.shared.settings import choice, number, whole
+from torchfovea.commands.shared.strategy import build_stop, build_strategy
+from torchfovea.deciding.strategies import Strategy
+from torchfovea.episode import Episode, Rules, run_episode, run_episodes
+from torchfovea.memory.egosphere import Memory
+from torchfovea.perception import Observer, Step, new_memory
+from torchfovea.search import Look
+from torchfovea.sensing.head import Head
+from torchfovea.setting import require
+from torchfovea.sim.arenas import GeometricArenas
+from torchfovea.sim.model import Scene
+from torchfovea.sim.truth import truth_of
+
+__all__ = ["batched", "one_episode", "prepare_episode", "roll_out", "sample_of"]
+
+StrategyFor = Callable[[Sequence[Truth]], Strategy]
+
+
+def batched(cfg: DictConfig) -> bool:
+    """Whether the episodes of a configuration can advance together."""
+    return bool(cfg.fidelity == "geometric" and name_of(cfg, "motor") == "instant")
+
+
+def device_of(cfg: DictConfig) -> str:
+    """Where episodes are computed; what cannot run there is refused.
+
+    Raises:
+        SettingError: for another word, a machine without the device, and episodes that run on the CPU alone.
+    """
+    device = choice(cfg, "device", ("cpu", "cuda"))
+    require(device == "cpu" or torch.cuda.is_available(), "device", device, "cpu, or cuda on a machine that has it")
+    require(device == "cpu" or batched(cfg), "device", device, "cpu, or fidelity=geometric motor=instant")
+    return device
+
+
+def sample_of(cfg: DictConfig) -> int | None:
+    """How many receptive fields a look goes through; None: all."""
+    return None if OmegaConf.select(cfg, "sensor.sample") is None else whole(cfg, "sensor.sample", 16)
+
+
+def one_episode(
+    cfg: DictConfig, observer: Observer, seed: int, each: Callable[[int, Look, Step], None] | None = None
+) -> Episode:
+    """The episode of one seed, with whatever sensor, renderer and motor."""
+    generator = torch.Generator().manual_seed(seed)
+    arena = build_arena(cfg, observer, seed)
+    memory = loaded_memory(cfg, observer)
+    if memory is None:
+        memory = new_memory(observer, build_cells(_aimed(cfg, arena.world.scene), observer.head, generator))
+    truth = arena.truth(memory.cells)
+    rules = _rules(cfg, build_strategy(cfg, observer, _aim(truth)))
+    return run_episode(observer, memory, arena, truth, generator, rules, each)
+
+
+def _rules(cfg: DictConfig, strategy: Strategy) -> Rules:
+    far_m, near_target_m = number(cfg, "far_m"), number(cfg, "near_target_m")
+    return Rules(whole(cfg, "saccades"), strategy, build_stop(cfg), far_m, near_target_m)
+
+
+def _aim(truth: Truth) -> Tensor:
+    return torch.nn.functional.normalize(truth.nearest_point, dim=-1)
+
+
+def _aimed(cfg: DictConfig, scene: Scene) -> DictConfig:
+    """The settings with a memory that is centred on the scene's own target, if it has no mean of its own."""
+    if "means" not in cfg.memory or cfg.memory.means is not None:
+        return cfg
+    mean = torch.nn.functional.normalize(scene.nearest_point_e, dim=-1).tolist()
+    merged = OmegaConf.merge(cfg, {"memory": {"means": [mean]}})
+    assert isinstance(merged, DictConfig)
+    return merged
+
+
+def _settings(text: str) -> DictConfig:
+    cfg = OmegaConf.create(text)
+    assert isinstance(cfg, DictConfig)
+    return cfg
+
+
+@lru_cache(maxsize=64)
+def _scene(settings: str, head: Head, seed: int) -> Scene:
+    return build_scene_of(_settings(settings), head, seed)
+
+
+@lru_cache(maxsize=64)
+def _start(settings: str, observer: Observer, seed: int) -> tuple[Memory, Tensor]:
+    """The memory of a seed, and where its generator stands after its cells were drawn."""
+    generator = torch.Generator().manual_seed(seed)
+    memory = new_memory(observer, build_cells(_settings(settings), observer.head, generator))
+    return memory, generator.get_state()
+
+
+def prepare_episode(cfg: DictConfig, observer: Observer, seed: int) -> tuple[Scene, Memory, Truth, torch.Generator]:
+    """What an episode starts from; scenes and memories are kept for the next call with the same settings."""
+    scene = _scene(OmegaConf.to_yaml(OmegaConf.masked_copy(cfg, ["scene", "trust"]), resolve=True), observer.head, seed)
+    generator, memory = torch.Generator().manual_seed(seed), loaded_memory(cfg, observer)
+    if memory is not None:
+        return scene, memory, truth_of(scene, memory.cells), generator
+    cells = OmegaConf.masked_copy(_aimed(cfg, scene), ["memory"])
+    memory, state = _start(OmegaConf.to_yaml(cells, resolve=True), observer, seed)
+    generator.set_state(state)
+    return scene, memory, truth_of(scene, memory.cells), generator
+
+
+def roll_out(
+    cfg: DictConfig,
+    observer: Observer,
+    seeds: Sequence[int],
+    strategy: StrategyFor | None = None,
+    each: Callable[[int, Any, Any], None] | None = None,
+) -> list[Episode]:
+    """Episodes of several seeds (a seed may come more than once) together, by the geometric sensor.
+
+    Args:
+        cfg: a search's.
+        observer: of that configuration.
+        seeds: one for each episode.
+        strategy: from the truths to a strategy for them all; by default the configuration's.
+        each: see `torchfovea.episode.run_episodes`.
+    """
+    parts = [prepare_episode(cfg, observer, seed) for seed in seeds]
+    scenes, memories, truths, generators = (list(part) for part in zip(*parts, strict=True))
+    device = device_of(cfg) if "device" in cfg else "cpu"
+    memory = _to(stack(memories), device)
+    if strategy is None:
+        aims = stack([_aim(truth) for truth in truths]).to(device)
+        chosen = build_strategy(cfg, observer, aims)
+    else:
+        chosen = strategy(truths)
+    return run_episodes(
+        observer,
+        memory,
+        GeometricArenas(scenes, observer, sample_of(cfg), device, build_motor(cfg)(scenes[0]), seeds),
+        truths,
+        generators,
+        _rules(cfg, chosen),
+        each,
+    )
+
+
+def _to(value: Any, device: str) -> Any:
+    if isinstance(value, tuple):
+        return type(value)(*(_to(part, device) for part in value))
+    return value.to(device) if isinstance(value, Tensor) else value

@@ -1,0 +1,1 @@
+"""`torchfovea tune`: gradient tuning."""
