@@ -22,6 +22,7 @@ FLOORS = (
     ("gaussian",),
     (
         "camera",
+        "lens",
         "lattice",
         "layout",
         "own_layout",

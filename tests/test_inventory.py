@@ -18,6 +18,7 @@ CORE = ("sensing", "stereo", "memory", "deciding", "perception.py", "search.py",
 MOST_PARAMETERS = 7
 
 FRONT_DOOR = [
+    "BrownConrady",
     "Budget",
     "Correspondences",
     "DirectionMixture",
@@ -29,6 +30,7 @@ FRONT_DOOR = [
     "Gaze",
     "Head",
     "Information",
+    "KannalaBrandt",
     "LogPolar",
     "Memory",
     "Motion",

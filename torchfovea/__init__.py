@@ -21,6 +21,7 @@ from torchfovea.sensing.camera import Fisheye, Pinhole
 from torchfovea.sensing.correspondence import Budget, Correspondences
 from torchfovea.sensing.head import Eyes, Gaze, Head, cyclopean, eyes, fixate
 from torchfovea.sensing.layout import LogPolar, Uniform
+from torchfovea.sensing.lens import BrownConrady, KannalaBrandt
 from torchfovea.sensing.retina import fovea, reconstruct
 from torchfovea.sensing.triangulation import Observations, observe, triangulate
 from torchfovea.sensing.unscented import SigmaPoints, unscented_transform
@@ -29,6 +30,7 @@ from torchfovea.setting import SettingError
 __version__ = "0.1.0"
 
 __all__ = [
+    "BrownConrady",
     "Budget",
     "Correspondences",
     "DirectionMixture",
@@ -40,6 +42,7 @@ __all__ = [
     "Gaze",
     "Head",
     "Information",
+    "KannalaBrandt",
     "LogPolar",
     "Memory",
     "Motion",

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -17,6 +18,57 @@ from torchfovea.gaussian import columns
 from torchfovea.setting import require
 
 __all__ = ["Camera", "Fisheye", "Pinhole", "image_camera"]
+
+
+_Plain = TypeVar("_Plain", "Pinhole", "Fisheye")
+
+
+@runtime_checkable
+class Camera(Protocol):
+    """What a camera tells; `Pinhole`, `Fisheye` and the lenses of `torchfovea.sensing.lens` do. Hashable.
+
+    What it cannot see it projects somewhere finite and says so in `in_view`; the ray of a pixel that it cannot see
+    anything through points straight behind, where nothing is in view.
+    """
+
+    @property
+    def focal_px(self) -> float:
+        """Pixels per unit of x/z on the optical axis, > 0; the mean where columns and rows differ."""
+        ...
+
+    @property
+    def cx_px(self) -> float:
+        """Column of the optical axis [px]."""
+        ...
+
+    @property
+    def cy_px(self) -> float:
+        """Row of the optical axis [px]."""
+        ...
+
+    def rays(self, px: Tensor) -> Tensor:
+        """Directions of pixels, (..., 2) to (..., 3)."""
+        ...
+
+    def ray_components(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """`rays` by components: x, y, z (...)."""
+        ...
+
+    def project(self, direction: Tensor) -> Tensor:
+        """Pixels of directions of any length, (..., 3) to (..., 2); finite everywhere."""
+        ...
+
+    def in_view(self, direction: Tensor) -> Tensor:
+        """Whether directions (..., 3) have a pixel; bool (...)."""
+        ...
+
+    def scaled(self, scale: float, shift_px: tuple[float, float]) -> Camera:
+        """The same camera in other pixels: place p becomes scale · p + shift."""
+        ...
+
+    def __hash__(self) -> int:
+        """By its numbers."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -69,6 +121,10 @@ class Pinhole:
     def in_view(self, direction: Tensor) -> Tensor:
         """Whether directions (..., 3) lie in front of the camera, so that they have a pixel; bool (...)."""
         return direction[..., 2] > 1e-6 * direction.abs().sum(-1)
+
+    def scaled(self, scale: float, shift_px: tuple[float, float]) -> Pinhole:
+        """The same camera in other pixels: place p becomes scale · p + shift."""
+        return _scaled(self, scale, shift_px)
 
 
 @dataclass(frozen=True)
@@ -125,11 +181,17 @@ class Fisheye:
         x, y, z = direction.unbind(-1)
         return (z > 0) | (x * x + y * y > 1e-12 * z * z)
 
+    def scaled(self, scale: float, shift_px: tuple[float, float]) -> Fisheye:
+        """The same camera in other pixels: place p becomes scale · p + shift."""
+        return _scaled(self, scale, shift_px)
 
-Camera = Pinhole | Fisheye
+
+def _scaled(camera: _Plain, scale: float, shift_px: tuple[float, float]) -> _Plain:
+    cx, cy = (scale * c + by for c, by in zip((camera.cx_px, camera.cy_px), shift_px, strict=True))
+    return replace(camera, focal_px=scale * camera.focal_px, cx_px=cx, cy_px=cy)
 
 
-def _require_numbers(camera: Camera) -> None:
+def _require_numbers(camera: Pinhole | Fisheye) -> None:
     require(0 < camera.focal_px < math.inf, "focal_px", camera.focal_px, "a positive number of pixels")
     for name in ("cx_px", "cy_px"):
         require(math.isfinite(getattr(camera, name)), name, getattr(camera, name), "a finite number of pixels")
@@ -143,5 +205,5 @@ def image_camera(camera: Camera, radius_px: float, size_px: int) -> Camera:
         radius_px: the retina's radius ρ_max [retinal px].
         size_px: side of the image [px]; its outermost pixel borders lie at the retina's radius.
     """
-    centre = (size_px - 1) / 2
-    return replace(camera, focal_px=camera.focal_px * size_px / (2 * radius_px), cx_px=centre, cy_px=centre)
+    centre, scale = (size_px - 1) / 2, size_px / (2 * radius_px)
+    return camera.scaled(scale, (centre, centre))

@@ -160,9 +160,10 @@ def frame_to_show(views: Views, retina: Retina | None, fov_deg: float) -> Rectif
 def _extent(camera: Camera, retina: Retina, rotation: Tensor, limit: float) -> tuple[Tensor, Tensor]:
     """The box of x/z and y/z that an eye's retina spans in the rectified frame: lowest (2,), highest (2,)."""
     angle = torch.linspace(0, 2 * math.pi, 257, device=rotation.device, dtype=rotation.dtype)
-    rim = retina.radius_px * torch.stack([torch.cos(angle), torch.sin(angle)], -1)
-    rim = torch.cat([rim, torch.zeros_like(rim[:1])])
-    directions = camera.rays(rim) @ rotation.mT
+    # a lens may show nothing at the rim: the widest ring that it does show decides
+    radius = retina.radius_px * torch.arange(9, device=rotation.device, dtype=rotation.dtype)[:, None] / 8
+    rays = camera.rays(torch.stack([radius * torch.cos(angle), radius * torch.sin(angle)], -1).flatten(0, 1))
+    directions = rays[camera.in_view(rays)] @ rotation.mT
     # what lies behind is beyond the limit on its side
     slope = directions[:, :2] / directions[:, 2:].clamp(min=1e-6)
     slope = slope.clamp(-limit, limit)

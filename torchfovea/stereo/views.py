@@ -68,11 +68,8 @@ class Views(NamedTuple):
     def cameras(self, retina: Retina | None) -> tuple[Camera, Camera]:
         """Both cameras in retinal pixels, those of the correspondences."""
         scale, (u, v) = self.scale(retina), self.origin_px(retina)
-        left, right = (
-            replace(c, focal_px=c.focal_px / scale, cx_px=(c.cx_px - u) / scale, cy_px=(c.cy_px - v) / scale)
-            for c in (self.camera_left, self.camera_right)
-        )
-        return left, right
+        shift = (-u / scale, -v / scale)
+        return self.camera_left.scaled(1 / scale, shift), self.camera_right.scaled(1 / scale, shift)
 
     def holds(self, px: Tensor, retina: Retina | None, slack_px: float = 0.0) -> Tensor:
         """Whether places (..., 2) [retinal px] lie on the images, or so many image pixels beyond; bool (...)."""
@@ -134,9 +131,7 @@ def verged_views(
     cameras = []
     for name, eye in (("camera", camera), ("camera_right", camera_right or camera)):
         _check_camera(name, eye)
-        scale = size / (2 * radius_px)
-        focal = eye.focal_px * size / (2 * radius_px)
-        cameras.append(replace(eye, focal_px=focal, cx_px=u + eye.cx_px * scale, cy_px=v + eye.cy_px * scale))
+        cameras.append(eye.scaled(size / (2 * radius_px), (u, v)))
     _check_rig(rig, images[0])
     return Views(*images, cameras[0], cameras[1], rig, (u, v))
 
@@ -226,7 +221,7 @@ def _image(name: str, image: Tensor | np.ndarray) -> Tensor:
 
 
 def _check_camera(name: str, camera: Camera) -> None:
-    require(isinstance(camera, Camera), name, camera, "a Pinhole or a Fisheye")
+    require(isinstance(camera, Camera), name, camera, "a camera: Pinhole, Fisheye, BrownConrady, KannalaBrandt")
 
 
 def _check_rig(rig: StereoRig, image: Tensor) -> None:
