@@ -398,8 +398,8 @@ def test_simulated_scenes(folder, capsys):
     run, result = calibrate(capsys, *sizes)
     assert result["after.mixture_nll"] < result["before.mixture_nll"] and result["observations"] > 1000
     assert 0.9 < result["after.coverage_95_by_area"] <= 0.99  # the fit weighs by area
-    again = calibrate(capsys, *sizes)[1]
-    assert again == result
+    again = calibrate(capsys, *sizes, "workers=2")[1]  # processes of one thread each, which may round otherwise
+    assert again == pytest.approx(result, rel=1e-3, abs=1e-5, nan_ok=True)
     text = (run / "budget" / "fitted.yaml").read_text()
     assert "scenes cans" in text and "source: true" in text
 
@@ -435,7 +435,7 @@ def test_a_mistake_is_one_line_and_leaves_nothing(folder, capsys, overrides, lin
     assert not list(folder.rglob("result.json"))
 
 
-@pytest.mark.parametrize("name", ["ours", "printed", "calibrated"])
+@pytest.mark.parametrize("name", ["ours", "printed"])
 def test_the_budgets_that_come_along(name):
     from hydra import compose, initialize_config_dir
 
@@ -445,8 +445,7 @@ def test_the_budgets_that_come_along(name):
     with initialize_config_dir(conf_dir(), version_base="1.3"):
         cfg = compose("sense", [f"budget={name}"])
     budget = construct(Budget, {**cfg.budget, "source_px": 400 if cfg.budget.source else None}, "budget")
-    expected = {"ours": Budget(), "printed": Budget.printed}.get(name, budget)
-    assert budget == expected and (budget.bend > 0) == (name == "calibrated")
+    assert budget == {"ours": Budget(), "printed": Budget.printed}[name]
 
 
 def test_one_standard_deviation_for_a_mixture_holds_its_95_percent():

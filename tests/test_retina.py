@@ -328,6 +328,19 @@ def test_wraps_around_in_angle_and_fills_the_centre():
     assert centre[2].abs() < 1e-12 and centre[1] == pytest.approx(centre[0].item() / 2)
 
 
+def test_rings_and_sectors_can_be_given():
+    assert LogPolar(1000).count == 999  # whole rings and sectors, squarest within half a per cent
+    retina = LogPolar(grid=(20, 50))
+    assert retina.count == 1000 and retina.shape == (20, 50) and len(retina.centers_px()) == 1000
+    for bad in ((0, 50), (20, 2), (100_000, 1000)):
+        with pytest.raises(SettingError, match=r"sensor\.grid"):
+            LogPolar(grid=bad)
+    with pytest.raises(SettingError, match=r"sensor\.grid"):
+        LogPolar(grid=(2, 500))  # far from square
+    with pytest.raises(SettingError, match="uniform_fovea"):
+        LogPolar(grid=(20, 50), uniform_fovea=True)
+
+
 def test_cortical_is_the_rings_of_the_retina():
     for retina in (LogPolar(300), LogPolar(300, uniform_fovea=True)):
         rho = retina.centers_px(dtype=torch.float64).norm(dim=-1)

@@ -10,7 +10,8 @@ import shutil
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, redirect_stdout
+from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -276,13 +277,22 @@ def _job(command: str, overrides: list[str], full_error: bool) -> Callable[[Any]
             _remove_bare(folder, settings.name)
             # Not an Exception, so that Hydra adds no line of its own.
             raise SystemExit(1) from None
-        print(folder, flush=True)
+        if sweeping or not _remove_bare(folder, settings.name):
+            print(folder, flush=True)
         return score
 
     return job
 
 
-def _remove_bare(folder: Path, name: str) -> None:
-    """Remove the folder of a run that failed before it wrote anything, if it holds Hydra's own files only."""
-    if {entry.name for entry in folder.iterdir()} <= {".hydra", f"{name}.log"}:
+def _remove_bare(folder: Path, name: str) -> bool:
+    """Remove the folder of a run that wrote nothing of its own, and the folders that this leaves empty."""
+    from torchfovea.commands.shared.manifest import MANIFEST
+
+    bare = {entry.name for entry in folder.iterdir()} <= {".hydra", f"{name}.log", MANIFEST}
+    if bare:
+        _close_logs()
         shutil.rmtree(folder, ignore_errors=True)
+        with suppress(OSError):  # not empty
+            for parent in takewhile(lambda above: above.is_relative_to(Path.cwd() / "outputs"), folder.parents):
+                parent.rmdir()
+    return bare

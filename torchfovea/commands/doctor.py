@@ -76,15 +76,18 @@ class Finding(NamedTuple):
 
 
 def run(cfg: DictConfig) -> None:
-    """Look, print the table, write ``doctor.csv`` and ``result.json`` (``ok``: the defaults, rays and SGBM, can run).
+    """Look and print the table; with `save` also write ``doctor.csv`` and ``result.json``.
+
+    Its ``ok`` says that the defaults, rays and SGBM, can run.
 
     Raises:
-        SettingError: for a time limit that is not positive.
+        SettingError: for a time limit that is not positive, and a `save` that is neither true nor false.
     """
     timeout_s = cfg.probe_timeout_s
     known = isinstance(timeout_s, int | float) and not isinstance(timeout_s, bool)
     require(known and timeout_s > 0, "probe_timeout_s", timeout_s, "a positive number")
     require(timeout_s <= 1e6, "probe_timeout_s", timeout_s, "a positive number of seconds, at most 1e6")
+    require(isinstance(cfg.save, bool), "save", cfg.save, "true or false")
     missing = [name for name in REQUIRED if not _version(name)]
     rays, rays_error = _probe(RAYS, timeout_s)
     sgbm, sgbm_error = _probe(SGBM, timeout_s)
@@ -110,6 +113,8 @@ def run(cfg: DictConfig) -> None:
     ]
     _show(findings)
     print(f"The defaults (rays, SGBM, pictures) can{'' if ok else 'not'} run{'.' if ok else ': see above.'}")
+    if not cfg.save:
+        return
     folder = run_folder()
     write_csv(folder / "doctor.csv", Finding._fields, findings)
     write_result(

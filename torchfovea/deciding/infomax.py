@@ -10,7 +10,7 @@ References:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -18,8 +18,6 @@ from torch import Tensor
 from torchfovea.setting import require
 
 __all__ = [
-    "eccentricity_law",
-    "gaze_information_gain",
     "information_gain",
     "minus_cost",
     "per_cost",
@@ -47,34 +45,12 @@ def information_gain(variance: Tensor, precision: Tensor, eligible: Tensor | Non
     Returns:
         (..., N), at least 0. Differentiable.
     """
-    blocks = (precision[..., part, :] for part in _parts(precision.shape[-2], variance.numel()))
-    return _gain(variance, blocks, eligible)
-
-
-def gaze_information_gain(
-    variance: Tensor,
-    directions: Tensor,
-    cells: Tensor,
-    law: Callable[[Tensor], Tensor],
-    half_view_rad: float = math.pi,
-    eligible: Tensor | None = None,
-) -> Tensor:
-    """`information_gain` with the precision of `precision_by_eccentricity`, which is never kept as a whole.
-
-    Args:
-        variance: of the quantity kept for each cell, (..., M).
-        directions: the candidates' unit vectors, (N, 3).
-        cells: the cells' unit vectors, (M, 3).
-        law: standard deviation as a function of the eccentricity [rad].
-        half_view_rad: eccentricity beyond which nothing is seen.
-        eligible: the cells whose entropy counts, (..., M); None counts all.
-
-    Returns:
-        (..., N), at least 0 [nats]. Differentiable.
-    """
-    parts = _parts(directions.shape[-2], variance.numel())
-    blocks = (precision_by_eccentricity(directions[part], cells, law, half_view_rad) for part in parts)
-    return _gain(variance, blocks, eligible)
+    if eligible is not None:
+        variance = torch.where(eligible, variance, 0.0)
+    count = precision.shape[-2]
+    step = max(1, _BLOCK // max(1, variance.numel()))
+    blocks = (precision[..., start : start + step, :] for start in range(0, count, step))
+    return torch.cat([0.5 * torch.log1p(variance[..., None, :] * block).sum(-1) for block in blocks], -1)
 
 
 def precision_by_eccentricity(
@@ -89,7 +65,7 @@ def precision_by_eccentricity(
     Args:
         directions: the candidates' unit vectors, (..., N, 3).
         cells: the cells' unit vectors, (..., M, 3).
-        law: standard deviation as a function of the eccentricity [rad], such as `eccentricity_law`.
+        law: standard deviation as a function of the eccentricity [rad], finite and positive.
         half_view_rad: eccentricity beyond which nothing is seen.
 
     Returns:
@@ -100,35 +76,6 @@ def precision_by_eccentricity(
     seen = angle <= half_view_rad
     sigma = law(torch.where(seen, angle, 0.0))
     return torch.where(seen, 1 / (sigma * sigma), 0.0)
-
-
-def eccentricity_law(sigma_fovea: float, sigma_per_rad: float) -> Callable[[Tensor], Tensor]:
-    """σ(e)² = sigma_fovea² + (sigma_per_rad · e)²: acuity that falls linearly, over what the source image allows.
-
-    Args:
-        sigma_fovea: standard deviation on the optical axis, > 0.
-        sigma_per_rad: its growth with eccentricity, ≥ 0; 0 for a uniform sensor.
-
-    Returns:
-        The law, from eccentricity [rad] to σ in the units of `sigma_fovea`.
-
-    Raises:
-        SettingError: a value out of its range.
-    """
-    require(0 < sigma_fovea < math.inf, "sigma_fovea", sigma_fovea, "a positive number")
-    require(0 <= sigma_per_rad < math.inf, "sigma_per_rad", sigma_per_rad, "a number of at least 0")
-    return lambda angle: torch.sqrt(sigma_fovea**2 + (sigma_per_rad * angle) ** 2)
-
-
-def _gain(variance: Tensor, blocks: Iterator[Tensor], eligible: Tensor | None) -> Tensor:
-    if eligible is not None:
-        variance = torch.where(eligible, variance, 0.0)
-    return torch.cat([0.5 * torch.log1p(variance[..., None, :] * block).sum(-1) for block in blocks], -1)
-
-
-def _parts(candidates: int, row: int) -> Iterator[slice]:
-    step = max(1, _BLOCK // max(1, row))
-    return (slice(start, start + step) for start in range(0, candidates, step))
 
 
 def saccade_degrees(direction: Tensor, directions: Tensor) -> Tensor:

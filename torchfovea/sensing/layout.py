@@ -21,6 +21,7 @@ from torchfovea.setting import require
 __all__ = ["LogPolar", "Retina", "Uniform", "cortical"]
 
 MOST = 10_000_000  # RFs of a retina
+Grid = tuple[int, int]  # rings and sectors
 ASPECT_TOLERANCE = 5.0  # an RF may be at most so many times longer than wide, or wider than long
 
 
@@ -77,15 +78,22 @@ class LogPolar:
         radius_px: ρ_max, radius of the retina [px].
         rho_min_px: ρ_min, inner border of the first ring [px].
         uniform_fovea: fill the disc inside ρ_min as the authors do.
+        grid: R and S themselves, in place of what meets the budget, which then does not count.
     """
 
     receptive_fields: int = 31416
     radius_px: float = 100.0
     rho_min_px: float = 1.0
     uniform_fovea: bool = False
+    grid: Grid | None = None
 
     def __post_init__(self) -> None:
         """Raise SettingError for a layout that cannot be built."""
+        if self.grid is not None:
+            most = f"at least 1 ring and 3 sectors, at most {MOST} receptive fields together"
+            rings, sectors = self.grid
+            require(rings >= 1 and sectors >= 3 and rings * sectors <= MOST, "sensor.grid", list(self.grid), most)
+            require(not self.uniform_fovea, "sensor.uniform_fovea", True, "false with sensor.grid, which has no fovea")
         _require_disc(self.receptive_fields, self.radius_px)
         require(
             0 < self.rho_min_px < self.radius_px,
@@ -95,12 +103,13 @@ class LogPolar:
         )
         rings, sectors, count = _log_polar_numbers(self)
         # 2 sectors have no neighbours on either side; an RF as long as a whole ring is wide is no log-polar layout
-        possible = rings >= 1 and sectors >= 3 and abs(count / self.receptive_fields - 1) <= BUDGET_TOLERANCE
+        budget = self.receptive_fields if self.grid is None else count
+        possible = rings >= 1 and sectors >= 3 and abs(count / budget - 1) <= BUDGET_TOLERANCE
         squareness = self.aspect if possible else math.inf
         require(
             possible and 1 / ASPECT_TOLERANCE <= squareness <= ASPECT_TOLERANCE,
-            "sensor.receptive_fields",
-            self.receptive_fields,
+            "sensor.receptive_fields" if self.grid is None else "sensor.grid",
+            self.receptive_fields if self.grid is None else list(self.grid),
             f"a budget that whole rings and sectors meet within {BUDGET_TOLERANCE:.1%} with RFs at most "
             f"{ASPECT_TOLERANCE:g} times as wide as long or as long as wide "
             f"(radius_px = {self.radius_px}, rho_min_px = {self.rho_min_px})",
@@ -118,7 +127,7 @@ class LogPolar:
 
     @property
     def count(self) -> int:
-        """The actual number of RFs, within 0.5% of the budget."""
+        """The actual number of RFs, within 0.5% of the budget: R·S, which few numbers are exactly; see `grid`."""
         return _log_polar_numbers(self)[2]
 
     @property
@@ -256,6 +265,8 @@ def _require_disc(receptive_fields: int, radius_px: float) -> None:
 @lru_cache(maxsize=256)
 def _log_polar_numbers(retina: LogPolar) -> tuple[int, int, int]:
     """Rings, sectors and count; (0, 0, 0) where the budget cannot be met."""
+    if retina.grid is not None:
+        return *retina.grid, math.prod(retina.grid)
     budget, growth = retina.receptive_fields, math.log(retina.radius_px / retina.rho_min_px)
     if retina.uniform_fovea:
         sectors = int(2 * math.sqrt(math.pi * budget) / math.sqrt(1 + 2 * growth))

@@ -22,8 +22,6 @@ from torchfovea.stereo.rig import StereoRig
 
 __all__ = ["Views", "grey_of", "posed_views", "rectified_views", "verged_views"]
 
-GREY = (0.299, 0.587, 0.114)  # ITU-R BT.601, as OpenCV's
-
 
 class Views(NamedTuple):
     """Two images of one moment; made by `verged_views`, `rectified_views` or `posed_views`, which check them.
@@ -100,8 +98,10 @@ class Views(NamedTuple):
 
 def grey_of(image: Tensor) -> Tensor:
     """Images (..., 1 or 3, H, W) in grey, (..., 1, H, W). Differentiable."""
-    weights = image.new_tensor(GREY if image.shape[-3] == 3 else (1.0,))
-    return (weights[:, None, None] * image).sum(-3, keepdim=True)
+    # kornia takes as long to import as this whole package; only who looks needs it
+    from kornia.color import rgb_to_grayscale
+
+    return rgb_to_grayscale(image) if image.shape[-3] == 3 else image
 
 
 def verged_views(

@@ -6,32 +6,29 @@ import math
 from dataclasses import asdict, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, NamedTuple
 
-import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from torchfovea.commands.calibrate.report import bins, print_figures, regions_of, table
-from torchfovea.commands.calibrate.truths import Truths, look_at_pair, look_at_world
+from torchfovea.commands.calibrate.simulated import SceneTask, looks_at_scenes
+from torchfovea.commands.calibrate.truths import Truths, look_at_pair
 from torchfovea.commands.shared.budgets import build_budget, made_for, write_budget
-from torchfovea.commands.shared.build import build_matcher, build_scene_of, build_sensor, choice, construct, whole
+from torchfovea.commands.shared.build import build_matcher, build_sensor, construct, whole
 from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.pairs import gaze_of, load_pair, named_pair
-from torchfovea.commands.shared.progress import progress_bar
+from torchfovea.commands.shared.parallel import workers_of
 from torchfovea.commands.shared.unread import refuse_unread
 from torchfovea.files import write_csv, write_result
 from torchfovea.sensing.correspondence import Budget
-from torchfovea.sensing.head import Gaze, Head, fixate
-from torchfovea.setting import SettingError, require
-from torchfovea.sim.scene import Scene
-from torchfovea.sim.world import World
+from torchfovea.setting import require
 from torchfovea.stereo.matchers import Matcher
 from torchfovea.studies.calibration import Judged, concatenate, inlier_of, judge, select, sigma_of
 from torchfovea.studies.fitting import BudgetFit, Likelihood, fit_budget, least_match_px
 from torchfovea.studies.shared_errors import KnownLook, lasting_share_of, shared_share
 
-__all__ = ["random_gazes", "run"]
+__all__ = ["run"]
 
 QUICK = {"scenes": 2, "judged_scenes": 2, "looks": 2}
 FULL = {"scenes": 16, "judged_scenes": 16, "looks": 2}
@@ -62,7 +59,7 @@ def run(cfg: DictConfig) -> float:
     refuse_unread("sensor.sample")
     cfg = _sized(cfg)
     scenes, judged_scenes = whole(cfg, "scenes", 0), whole(cfg, "judged_scenes")
-    looks, seed = whole(cfg, "looks"), whole(cfg, "seed", 0)
+    whole(cfg, "looks"), whole(cfg, "seed", 0), workers_of(cfg)
     require(isinstance(cfg.real, bool), "real", cfg.real, "true or false")
     require(OmegaConf.is_list(cfg.pairs), "pairs", cfg.pairs, "a list of motorcycle and folders")
     require(scenes > 0 or cfg.real or len(cfg.pairs) > 0, "scenes", scenes, "at least 1, real=true or pairs")
@@ -74,7 +71,7 @@ def run(cfg: DictConfig) -> float:
     angles = _edges(cfg, "fovs_deg", least=1) if len(cfg.fovs_deg) else [float(cfg.sensor.fov_deg)]
     data: dict[str, Split] = {}
     if scenes:
-        data["simulated"] = _simulate(cfg, start, matcher, scenes, judged_scenes, looks, seed, angles)
+        data["simulated"] = _simulate(cfg, start, scenes, judged_scenes, angles)
     data |= _pairs(cfg, start, matcher)
 
     def fit(*without: str) -> BudgetFit:
@@ -122,55 +119,14 @@ def run(cfg: DictConfig) -> float:
     return float(figures["after.mixture_nll"])
 
 
-def random_gazes(scene: Scene, world: World, count: int, generator: torch.Generator) -> list[Gaze]:
-    """Gazes that fixate surfaces in random directions within reach."""
-    head, found = world.head, []
-    for _ in range(1000 * count):
-        pan = math.radians(head.pan_limit_deg) * (2 * torch.rand((), generator=generator, dtype=torch.float64) - 1)
-        span = math.radians(head.tilt_up_deg + head.tilt_down_deg)
-        tilt = span * torch.rand((), generator=generator, dtype=torch.float64) - math.radians(head.tilt_up_deg)
-        forward = torch.cos(tilt)
-        direction = torch.stack([forward * torch.cos(pan), forward * torch.sin(pan), -torch.sin(tilt)])
-        hit = world.panorama(direction[None])
-        gaze, reachable = fixate(head, direction * hit.range_m[0])
-        if bool(reachable) and int(hit.geom[0]) >= 0:
-            found.append(gaze)
-        if len(found) == count:
-            return found
-    raise SettingError(f"scene = {type(scene.params).__name__}: expected a scene with surfaces within reach")
-
-
-def _simulate(
-    cfg: DictConfig,
-    budget: Budget,
-    matcher: Matcher,
-    scenes: int,
-    judged_scenes: int,
-    looks: int,
-    seed: int,
-    angles: list[float],
-) -> Split:
+def _simulate(cfg: DictConfig, budget: Budget, scenes: int, judged_scenes: int, angles: list[float]) -> Split:
     """Random looks at simulated scenes, in turn at each field of view; those to judge on have seeds of their own."""
-    head = construct(Head, cfg.head, "head")
-    renderer = cast(Literal["rays", "gl"], choice(cfg, "renderer.name", ("rays", "gl")))
+    seed, looks = whole(cfg, "seed", 0), whole(cfg, "looks")
     seeds = [seed + k for k in range(scenes)], [seed + JUDGED_SEEDS + k for k in range(judged_scenes)]
-    parts: tuple[list[list[Truths]], list[list[Truths]]] = ([], [])
-    with progress_bar() as p:
-        task = p.add_task("looks", total=(scenes + judged_scenes) * looks)
-        for part, those in zip(parts, seeds, strict=True):
-            for i, k in enumerate(those):
-                sized = cfg.copy()
-                sized.sensor.fov_deg = angles[i % len(angles)]
-                camera, retina = build_sensor(sized)
-                scene = build_scene_of(cfg, head, k)
-                world = World(
-                    scene, renderer=renderer, camera=camera, source_px=budget.source_px or 400,
-                    radius_px=retina.radius_px,
-                )  # fmt: skip
-                part.append([])
-                for gaze in random_gazes(scene, world, looks, torch.Generator().manual_seed(k)):
-                    part[-1].append(look_at_world(world, gaze, retina, budget, matcher))
-                    p.update(task, advance=1)
+    plain = OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"])
+    tasks = [SceneTask(plain, budget, k, angles[i % len(angles)], looks) for part in seeds for i, k in enumerate(part)]
+    found = looks_at_scenes(tasks)
+    parts = found[:scenes], found[scenes:]
     fitted, judged = (_known(concatenate([look.data for looks in part for look in looks])) for part in parts)
     return Split(fitted, judged, [look for part in parts for looks in part for look in looks], parts[0])
 

@@ -37,7 +37,7 @@ def construct(kind: type[T], node: DictConfig | dict[str, Any], where: str) -> T
 
 
 def typed(value: Any, kind: str, setting: str) -> Any:
-    """A value of a dataclass field's type, told by its name; `Range` is a pair of numbers.
+    """A value of a dataclass field's type, told by its name; `Range` is a pair of numbers, `Grid` of whole ones.
 
     Raises:
         SettingError: for a value of another type.
@@ -48,6 +48,10 @@ def typed(value: Any, kind: str, setting: str) -> Any:
         pair = not isinstance(value, str) and hasattr(value, "__len__") and len(value) == 2
         require(pair, setting, value, "two numbers, [least, most]")
         return tuple(typed(v, "float", setting) for v in value)
+    if kind == "Grid":
+        pair = not isinstance(value, str) and hasattr(value, "__len__") and len(value) == 2
+        require(pair, setting, value, "two whole numbers")
+        return tuple(typed(v, "int", setting) for v in value)
     number = isinstance(value, int | float) and not isinstance(value, bool) and value == value
     if kind == "float":
         require(number, setting, value, "a number")
