@@ -115,6 +115,7 @@ def acuity(images: Tensor, retina: Retina, scale: float, middle: tuple[float, fl
         (torch.arange(n, device=images.device, dtype=images.dtype) - m) / scale
         for n, m in ((width, middle[0]), (height, middle[1]))
     )
+    images = images - 0.5  # sums of squares lose least about 0
     place = columns(x, y[:, None])
     own = _level(retina.width_px(place), scale)
     rim = retina.width_px(place.new_tensor([retina.radius_px, 0.0]))
@@ -122,20 +123,28 @@ def acuity(images: Tensor, retina: Retina, scale: float, middle: tuple[float, fl
     pyramid = [images]
     for _ in range(top):
         pyramid.append(halve(pyramid[-1]))
-    full = [images]
-    for k in range(1, top + 1):
+    pixels = [torch.arange(n, device=images.device, dtype=images.dtype) for n in (width, height)]
+
+    def shown(k: int) -> Tensor:
+        """Level k of the pyramid, as large as the images."""
+        if k == 0:
+            return images
         rows, across = pyramid[k].shape[-2:]
-        pixels = (torch.arange(n, device=images.device, dtype=images.dtype) for n in (width, height))
         u, v = ((p + 0.5) * 0.5**k - 0.5 for p in pixels)
         grid = columns(u * (2 / max(across - 1, 1)) - 1, v[:, None] * (2 / max(rows - 1, 1)) - 1)
         grid = grid[None].expand(len(images), -1, -1, -1)
-        full.append(F.grid_sample(pyramid[k], grid, padding_mode="border", align_corners=True))
-    levels = []
-    for k in range(top + 1):
-        level = own.clamp(k, top)
-        levels.append(torch.stack([full[j] * (1 - (level - j).abs()).clamp(min=0) for j in range(k, top + 1)]).sum(0))
-    # about 0, sums of squares lose least in float32
-    return torch.cat(levels, 1) - 0.5
+        return F.grid_sample(pyramid[k], grid, padding_mode="border", align_corners=True)
+
+    # from the coarsest down, in place: at full size every image more that is held is one too many
+    levels = images.new_empty(len(images), top + 1, height, width)
+    levels[:, top:] = coarse = shown(top)
+    for k in reversed(range(top)):
+        fine = shown(k)
+        levels[:, k : k + 1] = torch.where(
+            own > k + 1, levels[:, k + 1 : k + 2], torch.lerp(fine, coarse, (own - k).clamp(0, 1))
+        )
+        coarse = fine
+    return levels
 
 
 def _level(width_px: Tensor, scale: float) -> Tensor:

@@ -35,6 +35,7 @@ class Views(NamedTuple):
         gaze_px: image pixel (column, row) that the retinas look at, in both images.
         rectified: whether the images are rectified views as they are: no rotation, and pinholes that differ in cx
             alone, so that matchers need not resample them.
+        span_px: side of the square about the gaze that the retinas span; None: the images' shorter side.
     """
 
     left: Tensor
@@ -44,11 +45,19 @@ class Views(NamedTuple):
     rig: StereoRig
     gaze_px: tuple[float, float]
     rectified: bool = False
+    span_px: int | None = None
 
     @property
     def source_px(self) -> int:
-        """The images' shorter side [px], which a retina spans."""
-        return min(self.left.shape[-2:])
+        """What a retina spans [px]: the images' shorter side, if nothing else is said."""
+        return min(self.left.shape[-2:]) if self.span_px is None else self.span_px
+
+    def whole(self) -> Views:
+        """The same, with retinas that span all of the images, whatever pixel they look at."""
+        height, width = self.left.shape[-2:]
+        (u, v) = self.gaze_px
+        reach = math.hypot(max(u, width - 1 - u) + 0.5, max(v, height - 1 - v) + 0.5)
+        return self._replace(span_px=math.ceil(2 * reach))
 
     @property
     def doffs_px(self) -> float:
