@@ -1,7 +1,7 @@
 """Whether a pair of pictures can be what it is said to be, before any number that follows from it is trusted.
 
 Pictures are asked for their levels; calibration, truth and foreign disparities are held against a few hundred sure
-matches (`torchfovea.stereo.sparse`) that believe none of them. Every fault is one `Finding` of one line. Rows that are
+matches (`torchfovea.stereo.sparse`) that believe none of them. Every fault is one `Fault` of one line. Rows that are
 apart by less than what must be an error become a term of the budget (`misaligned`), so that covariances stay honest.
 Nothing here is differentiable.
 """
@@ -22,12 +22,12 @@ from torchfovea.stereo.views import Views, grey_of
 
 __all__ = [
     "ROWS_PX",
-    "Finding",
-    "disparity_findings",
+    "Fault",
+    "disparity_faults",
     "full_scale",
-    "geometry_findings",
+    "geometry_faults",
     "misaligned",
-    "picture_findings",
+    "picture_faults",
     "placeholders",
     "rows_apart_px",
 ]
@@ -45,16 +45,16 @@ GAIN = 1.6
 AGREE = 0.5  # share of the matches, of which a tenth at depth edges is off
 
 
-class Finding(NamedTuple):
+class Fault(NamedTuple):
     """What is wrong.
 
     Attributes:
-        fault: a short name of its kind.
+        kind: a short name.
         line: one line: setting, what was found, what was expected.
         serious: whether the results would be wrong, and not only worse.
     """
 
-    fault: str
+    kind: str
     line: str
     serious: bool
 
@@ -80,7 +80,7 @@ def full_scale(peak: float, nominal: float) -> float:
 
 
 @torch.no_grad()
-def picture_findings(left: Tensor, right: Tensor) -> list[Finding]:
+def picture_faults(left: Tensor, right: Tensor) -> list[Fault]:
     """What the levels of two images (1 or 3, H, W) in [0, 1] tell."""
     found = []
     flats = []
@@ -90,22 +90,22 @@ def picture_findings(left: Tensor, right: Tensor) -> list[Finding]:
         flats.append(grey)
         if float(grey.median()) < DARK:
             line = f"{name}: half of the picture is darker than 4 of 255 levels: expected one that is exposed"
-            found.append(Finding("dark", line, False))
+            found.append(Fault("dark", line, False))
         if (white := float((grey >= BRIGHT).double().mean())) > SATURATED:
             line = f"{name}: {white:.0%} of the picture is white: expected one that is not saturated"
-            found.append(Finding("saturated", line, False))
+            found.append(Fault("saturated", line, False))
         few = len(
             (image[image.shape[0] // 2].flatten()[:: max(1, image[0].numel() // 100_000)] * 1023).round().unique()
         )
         if few < LEVELS:
             line = f"{name}: {few} grey levels: expected at least {LEVELS} (bits lost, or no texture)"
-            found.append(Finding("levels", line, False))
+            found.append(Fault("levels", line, False))
     one, other = (max(float(grey.mean()), 1e-6) for grey in flats)
     if not 1 / GAIN <= one / other <= GAIN:
         line = f"right: the left picture is {one / other:.2g} times as bright: expected one exposure for both"
-        found.append(Finding("exposure", line, False))
+        found.append(Fault("exposure", line, False))
     if left.shape == right.shape and bool((left == right).all()) and float(flats[0].std()) > 1e-3:
-        found.append(Finding("same", "right: the same picture as left: expected the other eye's", True))
+        found.append(Fault("same", "right: the same picture as left: expected the other eye's", True))
     return found
 
 
@@ -144,11 +144,11 @@ def rows_apart_px(views: Views, matches: SparseMatches) -> tuple[float, Tensor]:
 
 
 @torch.no_grad()
-def geometry_findings(views: Views, matches: SparseMatches) -> tuple[list[Finding], float]:
+def geometry_faults(views: Views, matches: SparseMatches) -> tuple[list[Fault], float]:
     """What sure matches say of the calibration.
 
     Returns:
-        The findings, and how far the rows are apart [image px] (`rows_apart_px`); 0 where too few matches tell.
+        The faults, and how far the rows are apart [image px] (`rows_apart_px`); 0 where too few matches tell.
     """
     count = len(matches.left_px)
     if matches.tried >= 5 * FEWEST and count < FEWEST:
@@ -156,7 +156,7 @@ def geometry_findings(views: Views, matches: SparseMatches) -> tuple[list[Findin
             f"right: only {count} of {matches.tried} corners of the left picture are found in it: expected the other "
             "eye's view of the same moment, upright and near the same rows"
         )
-        return [Finding("unlike", line, True)], 0.0
+        return [Fault("unlike", line, True)], 0.0
     if count < FEWEST:
         return [], 0.0
     found = []
@@ -167,13 +167,13 @@ def geometry_findings(views: Views, matches: SparseMatches) -> tuple[list[Findin
             f"left, right: {beyond:.0%} of {count} sure matches lie beyond infinity (x_left - x_right + doffs_px < 0): "
             "expected the left eye's picture as left, and this pair's doffs_px"
         )
-        found.append(Finding("swapped", line, True))
+        found.append(Fault("swapped", line, True))
     if rows_px > ROWS_NOTED_PX:
         apart = f"left, right: the rows of {count} sure matches are {rows_px:.2g} px apart"
         expected = f"expected a rectified pair and a calibration that is not stale (at most {ROWS_PX:g} px)"
         worse = "standard deviations are widened by it"
         serious = rows_px > ROWS_PX
-        found.append(Finding("rows", f"{apart}: {expected if serious else worse}", serious))
+        found.append(Fault("rows", f"{apart}: {expected if serious else worse}", serious))
     return found, rows_px
 
 
@@ -188,7 +188,7 @@ def misaligned(budget: Budget, rows_px: float) -> Budget:
 
 
 @torch.no_grad()
-def disparity_findings(disparity: Tensor, matches: SparseMatches, setting: str) -> list[Finding]:
+def disparity_faults(disparity: Tensor, matches: SparseMatches, setting: str) -> list[Fault]:
     """Whether a disparity map of a rectified pair is what sure matches show.
 
     Args:
@@ -211,16 +211,16 @@ def disparity_findings(disparity: Tensor, matches: SparseMatches, setting: str) 
             what += ", the other sign"
         elif abs(ratio) > 1.5:
             what += f", units of 1/{abs(ratio):.3g} px"
-        return [Finding("units", f"{setting}: {what}: expected x_left - x_right in pixels of these images", True)]
+        return [Fault("units", f"{setting}: {what}: expected x_left - x_right in pixels of these images", True)]
     share = _agree(told, shown)
     line = (
         f"{setting}: only {share:.0%} of {len(told)} sure matches of the pictures agree with it: expected this pair's"
     )
-    return [Finding("foreign", f"{line} x_left - x_right in pixels", True)]
+    return [Fault("foreign", f"{line} x_left - x_right in pixels", True)]
 
 
 @torch.no_grad()
-def placeholders(disparity: Tensor, doffs_px: float, setting: str) -> tuple[Tensor, list[Finding]]:
+def placeholders(disparity: Tensor, doffs_px: float, setting: str) -> tuple[Tensor, list[Fault]]:
     """Numbers of a disparity map that stand for nothing: 0, a repeated negative one, and what lies beyond infinity.
 
     Args:
@@ -229,7 +229,7 @@ def placeholders(disparity: Tensor, doffs_px: float, setting: str) -> tuple[Tens
         setting: the map's name.
 
     Returns:
-        bool (H, W), where they stand, and the finding.
+        bool (H, W), where they stand, and the fault.
     """
     finite = torch.isfinite(disparity)
     none = torch.zeros_like(finite)
@@ -245,7 +245,7 @@ def placeholders(disparity: Tensor, doffs_px: float, setting: str) -> tuple[Tens
     which = ", ".join(f"{v:g}" for v in often[:3].tolist()) or "what lies beyond infinity"
     share = float(stands.double().sum() / finite.sum())
     line = f"{setting}: {share:.1%} of it is {which}: expected NaN where it is unknown; taken for that"
-    return stands, [Finding("placeholder", line, False)]
+    return stands, [Fault("placeholder", line, False)]
 
 
 def _agree(told: Tensor, shown: Tensor) -> float:

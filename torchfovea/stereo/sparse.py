@@ -68,13 +68,15 @@ def match_sparse(views: Views) -> SparseMatches:
     found = np.zeros((0, 2)) if corners is None else corners[:, 0].round().astype(int)
     inside = ((found >= HALF) & (found < np.array(size) - HALF)).all(-1)
     start = found[inside].astype(int)
-    pairs = [(place, there) for place in start if (there := _there_and_back(cv2, *small, place)) is not None]
+    pairs = [
+        (place, there) for place in start if (there := _there_and_back(cv2, small[0], small[1], place)) is not None
+    ]
     none = views.left.new_zeros(0, 2)
     if not pairs:
         return SparseMatches(none, none, len(start))
     one, other = ((np.array(side, np.float32) + 0.5) * factor - 0.5 for side in zip(*pairs, strict=True))
     one, other = _refined(cv2, left, right, one.astype(np.float32), other.astype(np.float32), 1 / scale)
-    return SparseMatches(*(torch.from_numpy(side).to(none) for side in (one, other)), len(start))
+    return SparseMatches(torch.from_numpy(one).to(none), torch.from_numpy(other).to(none), len(start))
 
 
 def _bytes(image: Tensor) -> np.ndarray:
