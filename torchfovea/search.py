@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -53,6 +53,7 @@ class Look(NamedTuple):
     pictures: Any = None
 
 
+@runtime_checkable
 class Robot(Protocol):
     """What searches: a robot, a simulated one, or B of either."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 
@@ -28,6 +28,7 @@ class Moved(NamedTuple):
     degrees: float
 
 
+@runtime_checkable
 class Motor(Protocol):
     """What turns the head: `InstantMotor`, `torchfovea.sim.servo.ServoMotor`, or anything else that moves like them."""
 

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -60,6 +60,7 @@ class Frame(NamedTuple):
     normal: Tensor
 
 
+@runtime_checkable
 class Renderer(Protocol):
     """What draws a picture: `render`, `torchfovea.sim.gl.render`, or any function like them."""
 

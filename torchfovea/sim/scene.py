@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -57,6 +57,7 @@ class AttentionWorld:
         return scene_of(_attention_solids(self, rng), head, rng, self, seed)
 
 
+@runtime_checkable
 class SceneRecipe(Protocol):
     """What builds a scene: `AttentionWorld`, `Cans`, or any function of a seed and a head."""
 

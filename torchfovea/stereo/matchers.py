@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from torch import Tensor
 
@@ -18,6 +18,7 @@ from torchfovea.stereo.views import Views
 __all__ = ["Match", "Matcher", "checked_matches"]
 
 
+@runtime_checkable
 class Match(Protocol):
     """What matches two images: a `Matcher`, or any function like it."""
 
