@@ -13,6 +13,7 @@ from torch import Tensor
 from torchfovea.memory.sphere import direction_mixture
 from torchfovea.tuning.bias import Shape, encode, features, fix_vector
 from torchfovea.tuning.problem import Problem, evaluate_bias, play_each
+from torchfovea.tuning.rivals import best_alpha
 from torchfovea.tuning.scenes import Distribution, stream
 
 __all__ = ["SEARCHES", "TABLE_1", "hand", "table_1"]
@@ -43,9 +44,10 @@ def _centre(azimuth_deg: Tensor, elevation_deg: Tensor) -> Tensor:
 def hand(
     problem: Problem, alpha: float = 1.0, scenes: int = 512, sigmas: tuple[float, ...] = _SIGMAS
 ) -> tuple[Tensor, float]:
-    """One isotropic Gaussian on each region's centre, all with the σ that is best on validation scenes.
+    """One isotropic Gaussian on each region's centre, with the σ and then the α that are best on validation scenes.
 
-    It knows the distribution's own definition; for a conditioned one its means follow the task, by least squares.
+    `alpha` is what σ is chosen with. It knows the distribution's own definition; for a conditioned one its means follow
+    the task, by least squares.
 
     Returns:
         The vector and its σ.
@@ -63,7 +65,7 @@ def hand(
         )
         scored.append((float(evaluate_bias(problem, vector, scenes, stream("validation", 0)).mean()), sigma, vector))
     _, sigma, vector = max(scored, key=lambda item: item[0])
-    return vector, sigma
+    return best_alpha(problem, vector, scenes)[0], sigma
 
 
 def _plain_hand(shape: Shape, distribution: Distribution, sigma: float, alpha: float) -> Tensor:

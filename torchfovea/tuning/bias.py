@@ -15,7 +15,7 @@ from torchfovea.setting import require
 
 __all__ = [
     "Bias", "Shape", "decode", "draw_cells", "encode", "features", "fix_vector", "fov_of", "log_density_each",
-    "log_normalizer_each", "mixture_of", "reachable",
+    "log_normalizer_each", "mixture_of", "numbers_of", "reachable",
 ]  # fmt: skip
 
 REACH_RANGE_M = 1.0  # as in `torchfovea.commands.shared.build`: a direction is reachable if its point at 1 m is
@@ -143,16 +143,19 @@ def encode(shape: Shape, mixture: DirectionMixture, alpha: float) -> Tensor:
     noise = torch.Generator().manual_seed(0)
     apart = torch.randn(m, 3, generator=noise, dtype=torch.float64) * (0.3 if m > given else 0)
     means = mixture.means[which] + apart * (torch.arange(m) >= given)[:, None]
-    factor = mixture.cholesky[which]
-    diagonal = factor.diagonal(dim1=-2, dim2=-1).log().clamp(*_LOG_DIAGONAL)
-    lower = torch.stack((factor[:, 1, 0], factor[:, 2, 0], factor[:, 2, 1]), -1)
-    parts = [means.flatten(), diagonal.flatten(), lower.flatten()]
-    if m > 1:
-        parts.append(mixture.logits[which])
-    body = torch.cat(parts)
+    body = numbers_of(DirectionMixture(mixture.logits[which], means, mixture.cholesky[which]))
     if shape.conditioned:
         body = torch.cat((body, torch.zeros(5 * len(body), dtype=torch.float64)))
     return torch.cat([body, shape.tail(alpha, shape.fov_deg)])
+
+
+def numbers_of(mixture: DirectionMixture) -> Tensor:
+    """A mixture as `Shape.numbers` numbers of a vector, in the mixture's own gauge."""
+    factor = mixture.cholesky
+    diagonal = factor.diagonal(dim1=-2, dim2=-1).log().clamp(*_LOG_DIAGONAL)
+    lower = torch.stack((factor[:, 1, 0], factor[:, 2, 0], factor[:, 2, 1]), -1)
+    parts = [mixture.means.flatten(), diagonal.flatten(), lower.flatten()]
+    return torch.cat(parts if len(factor) == 1 else [*parts, mixture.logits])
 
 
 def fov_of(shape: Shape, vector: Tensor) -> float:

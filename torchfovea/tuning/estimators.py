@@ -39,7 +39,7 @@ __all__ = [
     "pull",
 ]
 
-_ALPHA_STEP = 0.25  # of log α, to either side
+_ALPHA_STEP = 0.05  # of log α, to either side: at a kink a wider one averages slopes of both sides
 _FOV_STEP = 0.15  # of log tan(fov/2)
 
 

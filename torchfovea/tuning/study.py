@@ -15,6 +15,7 @@ from torch import Tensor
 from torchfovea.setting import SettingError, require
 from torchfovea.tuning.baselines import SEARCHES
 from torchfovea.tuning.problem import Problem, evaluate_bias
+from torchfovea.tuning.rivals import RIVALS
 from torchfovea.tuning.scenes import stream
 from torchfovea.tuning.train import ESTIMATORS, Schedule, train
 
@@ -58,13 +59,22 @@ def budgets_up_to(episodes: int) -> list[int]:
 
 
 def check_methods(methods: Collection[str]) -> None:
-    """Raise SettingError for a name that is neither ESTIMATOR or ESTIMATOR+WARM, nor SEARCH or SEARCH@EPISODES."""
-    words = "any of " + ", ".join([*ESTIMATORS, *SEARCHES]) + "; ESTIMATOR+WARM or SEARCH@EPISODES of an evaluation"
+    """Raise SettingError for a name that is no ESTIMATOR or ESTIMATOR+WARM, no SEARCH or SEARCH@EPISODES, no rival."""
+    words = (
+        "any of "
+        + ", ".join([*ESTIMATORS, *SEARCHES, *RIVALS])
+        + "; ESTIMATOR+WARM or SEARCH@EPISODES of an evaluation"
+    )
     for method in methods:
         name, _, warm = method.partition("+")
         search, at, each = method.partition("@")
         a_search = search in SEARCHES and (not at or (each.isdecimal() and int(each) > 0))
-        require(a_search or (name in ESTIMATORS and warm in (*ESTIMATORS, "none", "")), "methods", method, words)
+        require(
+            method in RIVALS or a_search or (name in ESTIMATORS and warm in (*ESTIMATORS, "none", "")),
+            "methods",
+            method,
+            words,
+        )
 
 
 def curves(
@@ -134,6 +144,9 @@ def _incumbents(
     if search in SEARCHES:
         options = {"per_evaluation": int(each)} if at else {}
         yield from SEARCHES[search](problem, start, schedule.episodes, seed, **options)
+        return
+    if method in RIVALS:
+        yield from RIVALS[method](problem, start, schedule.episodes, seed)
         return
     name, _, warm = method.partition("+")
     own = replace(schedule, estimator=name, seed=seed, validations=1, validation_scenes=1)
