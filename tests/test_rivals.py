@@ -17,6 +17,8 @@ from torchfovea.tuning.bias import Shape, decode, features, mixture_of
 from torchfovea.tuning.problem import Problem, evaluate_bias, play
 from torchfovea.tuning.scenes import Distribution, first_surfaces, stream
 from torchfovea.tuning.simulator import Run, Task
+from torchfovea.tuning.study import Heldout, check_methods, curves
+from torchfovea.tuning.train import Schedule
 
 NO_TASK = torch.zeros(1, 2)
 
@@ -140,3 +142,14 @@ def test_alpha_is_the_best_on_validation_scenes():
     assert min(abs(math.exp(float(by_hand[p.shape.body])) - alpha) for alpha in rivals.ALPHAS) < 1e-6
     fixed = problem(tune_alpha=False, alpha=0.7)
     assert torch.equal(rivals.best_alpha(fixed, table_1(fixed.shape, "target"), 8)[0], table_1(fixed.shape, "target"))
+
+
+def test_rivals_have_learning_curves():
+    p = problem()
+    schedule = Schedule(episodes=128, validation_scenes=16)
+    found = curves(p, table_1(p.shape, "unbiased"), ["fitted", "remembered"], 1, schedule, Heldout(16, 1))
+    assert [[row[:3] for row in curve] for curve in found] == [
+        [(name, 0, 64), (name, 0, 128)] for name in ("fitted", "remembered")
+    ]
+    with pytest.raises(SettingError, match="methods = fitted@8"):
+        check_methods(["fitted@8"])

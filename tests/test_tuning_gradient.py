@@ -462,7 +462,8 @@ def test_the_command_keeps_its_contract(tmp_path, capsys):
     assert (folder / "curves.csv").read_text() == table and json.loads((folder / "result.json").read_text()) == result
     assert main([*again, "seeds=3"]) == 1
     assert "made with other settings" in capsys.readouterr().err
-    for policy in ("unbiased", "top", "down", "target", "hand", "tuned", "prior_field", "tuned_with_prior_field"):
+    rivals = ("hand", "fitted", "remembered", "prior_field", "tuned_with_prior_field")
+    for policy in ("unbiased", "top", "down", "target", "tuned", *rivals):
         low, mid, high = (result[f"heldout.{policy}.{k}"] for k in ("ci_low", "gap_per_saccade", "ci_high"))
         assert 0 <= low <= mid <= high <= 1
     assert result["episodes_used"] >= 40 and result["curves.random.heldout"] > 0
@@ -495,6 +496,8 @@ def test_the_commands_mistakes_are_one_line(tmp_path, capsys):
     for settings, words in (
         (["resume=nowhere.pt"], "resume = nowhere.pt"),
         (["estimator=magic"], "estimator = magic"),
+        (["start=magic"], "start = magic: expected one of memory, hand, fitted, remembered"),
+        (["start_episodes=3"], "start_episodes = 3"),
         (["tune_fov=true", "sensor.fov_deg=170"], "sensor.fov_deg = 170"),
         (["memory=geodesic"], "memory = geodesic"),
         (["distribution.regions=[[100,120,0,10]]"], "distribution.regions"),

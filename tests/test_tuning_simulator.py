@@ -138,7 +138,9 @@ def episode_by_loop(task, scenes, b, world, alpha):
         for i in range(cells):
             mean = vector[i] / precision[i]
             place = world.direction[b, i] / max(mean, 1e-3)
-            ground = seen[i] and float(place[2]) + head.ego_height_m < limits.ground_z_m
+            unsure = abs(float(world.direction[b, i, 2])) / max(mean, 1e-3) ** 2 / math.sqrt(precision[i])
+            surely = float(place[2]) - limits.ground_sigmas * unsure
+            ground = seen[i] and surely + head.ego_height_m < limits.ground_z_m
             if bool(fixate(head, place)[1]) and float(place.norm()) > limits.nearest_m and not ground:
                 value = mean + alpha / math.sqrt(precision[i])
                 if value > best:

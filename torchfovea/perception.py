@@ -57,15 +57,21 @@ class Eligibility:
     Attributes:
         nearest_m: points nearer than this are not looked at.
         ground_z_m: a seen cell whose point lies lower than this above the floor is ground, and not an object.
+        ground_sigmas: by so many standard deviations of its height must a point lie above that. Of the hundreds of
+            cells on a floor that is seen out of the corner of an eye, noise lifts some well above it, and the nearest
+            of them would win every comparison: the floor is nearer than most objects.
     """
 
     nearest_m: float = 0.5
     ground_z_m: float = 0.05
+    ground_sigmas: float = 2.0
 
     def __post_init__(self) -> None:
         """Raise SettingError for a negative distance, and numbers that are not finite."""
         require(0 <= self.nearest_m < math.inf, "eligibility.nearest_m", self.nearest_m, "at least 0 metres")
         require(math.isfinite(self.ground_z_m), "eligibility.ground_z_m", self.ground_z_m, "a finite height in metres")
+        sigmas = self.ground_sigmas
+        require(0 <= sigmas < math.inf, "eligibility.ground_sigmas", sigmas, "0 or more standard deviations")
 
 
 @dataclass(frozen=True)
@@ -278,9 +284,10 @@ def decide(
     doubted = seen & (trust(memory) < 0.5)
     at, instead = points.mean.unbind(-1), _unseen_points(memory).unbind(-1)
     target = columns(*(torch.where(doubted, there, here) for there, here in zip(instead, at, strict=True)))
-    x, y, z = at
-    ground = seen & (z + observer.head.ego_height_m < observer.eligibility.ground_z_m)
-    far_enough = (x * x).addcmul_(y, y).addcmul_(z, z) > observer.eligibility.nearest_m**2
+    (x, y, z), limits = at, observer.eligibility
+    surely = z - limits.ground_sigmas * points.cov[..., 5].sqrt()
+    ground = seen & (surely + observer.head.ego_height_m < limits.ground_z_m)
+    far_enough = (x * x).addcmul_(y, y).addcmul_(z, z) > limits.nearest_m**2
     eligible = can_fixate(observer.head, target) & far_enough & ~ground
     floor = torch.full_like(reward.mean, -torch.inf)
     incumbent = torch.where(eligible & seen, reward.mean, floor).amax(-1)

@@ -206,7 +206,10 @@ def score(task: Task, world: Worlds, memory: Known, alpha: Tensor) -> tuple[Tens
     point = world.direction * range_m[..., None]
     reachable = fixate(observer.head, point)[1]
     limits = observer.eligibility
-    ground = memory.seen & (point[..., 2] + observer.head.ego_height_m < limits.ground_z_m)
+    # to first order, a range of 1/ρ along a direction is unsure by σ/ρ²
+    height = point[..., 2] + observer.head.ego_height_m
+    height = height - limits.ground_sigmas * std * range_m * point[..., 2].abs()
+    ground = memory.seen & (height < limits.ground_z_m)
     eligible = world.allowed & reachable & (range_m > limits.nearest_m) & ~ground
     value = upper_confidence_bound(reward.mean, reward.std, alpha.to(mean).expand(mean.shape[:1]))
     return torch.where(eligible, value, torch.full_like(value, -math.inf)), point

@@ -207,7 +207,7 @@ def decide(
     seen: np.ndarray,
     head: Head,
     prior: tuple[float, float],
-    limits: tuple[float, float],
+    limits: tuple[float, float, float],
     alpha: float,
 ) -> Choice:
     """Reward, upper confidence bound and the next fixation, in NumPy.
@@ -220,7 +220,7 @@ def decide(
         seen: bool (Nx,).
         head: its limits.
         prior: mean and standard deviation of an unseen cell's inverse range.
-        limits: nearest range, and the height below which all is ground [m].
+        limits: nearest range, the height below which all is ground [m], and by how many deviations a point is above.
         alpha: of the upper confidence bound.
     """
     cov = np.linalg.inv(matrix)
@@ -232,7 +232,8 @@ def decide(
     along = range_m**4 * cov[:, 2, 2] - across
     spread = across[:, None, None] * np.eye(3, dtype=cells.dtype)
     spread = spread + along[:, None, None] * cells[:, :, None] * cells[:, None]
-    ground = seen & (points[:, 2] + head.ego_height_m < limits[1])
+    height = points[:, 2] - limits[2] * np.sqrt(spread[:, 2, 2])
+    ground = seen & (height + head.ego_height_m < limits[1])
     eligible = _reachable(points, head) & (range_m > limits[0]) & ~ground
     score = np.where(eligible, rho + alpha * std, -np.inf)
     return Choice(int(score.argmax()), score, points, spread, rho, std)
@@ -255,7 +256,7 @@ def step(
     slope_std: float,
     head: Head,
     prior: tuple[float, float],
-    limits: tuple[float, float],
+    limits: tuple[float, float, float],
     alpha: float,
 ) -> Choice:
     """A whole step in NumPy and SciPy: correspondences in, the next fixation out.

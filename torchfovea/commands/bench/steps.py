@@ -29,8 +29,9 @@ def _known(memory: Memory) -> tuple[Any, ...]:
     return (*(part.cpu().contiguous().numpy() for part in parts), (memory.looks > 0).cpu().numpy())
 
 
-def _limits(observer: Observer) -> tuple[float, float]:
-    return observer.eligibility.nearest_m, observer.eligibility.ground_z_m
+def _limits(observer: Observer) -> tuple[float, float, float]:
+    limits = observer.eligibility
+    return limits.nearest_m, limits.ground_z_m, limits.ground_sigmas
 
 
 def _strategy(look: Saccade) -> Strategy:
