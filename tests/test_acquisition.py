@@ -265,6 +265,12 @@ def test_one_generator_a_row_equals_one_by_one():
         aq.choose(coarse, eligible, [generator(), generator()])
 
 
+def test_nothing_to_choose_from_is_named():
+    for score in (torch.zeros(0), torch.zeros(3, 0), torch.zeros(())):
+        with pytest.raises(SettingError, match=r"score = \(.*\): expected at least one cell"):
+            aq.choose(score, torch.ones(score.shape, dtype=torch.bool), generator())
+
+
 def test_choose():
     score = torch.tensor([1.0, 3.0, 3.0, math.nan, 9.0, -math.inf])
     eligible = torch.tensor([True, True, True, True, False, True])

@@ -159,6 +159,12 @@ def test_calibration_by_loops_with_outliers_and_masks():
     assert mt.coverage(z, levels, valid).tolist() == pytest.approx(expected)
 
 
+def test_a_search_without_fixations_is_named():
+    for figure in (mt.gap, mt.gap_per_saccade):
+        with pytest.raises(SettingError, match=r"rewards = \(2, 0\): expected at least one fixation"):
+            figure(torch.zeros(2, 0), torch.zeros(2))
+
+
 def test_calibration_refuses():
     nothing = torch.zeros(3, dtype=torch.bool)
     for function in (mt.nees_mean, mt.outlier_share, mt.coverage):

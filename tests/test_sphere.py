@@ -296,6 +296,7 @@ def test_reparameterized_gradient_agrees_with_the_density():
         ([1.0], [[0.0] * 3], {"cholesky": [[1.0] * 3]}, "cholesky"),
         ([1.0], [[0.0] * 3], {"cholesky": [[[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]]}, "cholesky"),
         ([1.0], [[0.0] * 3], {}, "covariances"),
+        ([1.0], [[0.0] * 3], {"covariances": [[1.0] * 3], "dtype": torch.float16}, r"means\.dtype"),
     ],
 )
 def test_bad_mixtures_are_named(weights, means, keywords, named):

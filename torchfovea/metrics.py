@@ -51,7 +51,11 @@ def gap(rewards: Tensor, best: Tensor) -> Tensor:
     Returns:
         (..., T), clamped to [0, 1] (a ray may pass the best by a rounding), never falling; 1 where the first fixation
         is already the best.
+
+    Raises:
+        SettingError: without a fixation.
     """
+    require(rewards.shape[-1] > 0, "rewards", tuple(rewards.shape), "at least one fixation, (..., T)")
     first = rewards[..., :1]
     room = best[..., None] - first
     gained = rewards.cummax(-1).values - first

@@ -260,8 +260,9 @@ def choose(score: Tensor, eligible: Tensor, generator: Generators | None = None)
         (...) int64; −1 where no cell can be chosen. Not differentiable.
 
     Raises:
-        SettingError: the number of generators is not the number of rows.
+        SettingError: no cell at all, or a number of generators that is not the number of rows.
     """
+    require(score.dim() > 0 and score.shape[-1] > 0, "score", tuple(score.shape), "at least one cell, (..., N)")
     score = score.detach()
     valid = eligible & ~score.isnan()
     score = score.expand(valid.shape)

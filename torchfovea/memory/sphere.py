@@ -98,7 +98,7 @@ def direction_mixture(
         The mixture, differentiable in the tensors given.
 
     Raises:
-        SettingError: naming what is wrong: shapes, values that are not finite, weights that are not positive,
+        SettingError: naming what is wrong: shapes, half precision, values that are not finite, weights that are not positive,
             covariances that are not symmetric positive definite, or factors that are not lower triangular with a
             positive diagonal.
     """
@@ -108,6 +108,7 @@ def direction_mixture(
     require(
         mean.ndim == 2 and mean.shape[-1] == 3 and len(mean) > 0, "means", tuple(mean.shape), "the shape (M, 3), M >= 1"
     )
+    require(mean.dtype in (torch.float32, torch.float64), "means.dtype", mean.dtype, "torch.float32 or torch.float64")
     m = len(mean)
     weight = _numbers("weights", weights, mean.dtype, mean.device)
     require(weight.shape == (m,), "weights", tuple(weight.shape), f"the shape ({m},), one for each mean")
