@@ -98,8 +98,8 @@ def direction_mixture(
         The mixture, differentiable in the tensors given.
 
     Raises:
-        SettingError: naming what is wrong: shapes, half precision, values that are not finite, weights that are not positive,
-            covariances that are not symmetric positive definite, or factors that are not lower triangular with a
+        SettingError: naming what is wrong: shapes, half precision, values that are not finite, weights that are not
+            positive, covariances that are not symmetric positive definite, or factors that are not lower triangular with a
             positive diagonal.
     """
     one = (covariances is None) != (cholesky is None)
