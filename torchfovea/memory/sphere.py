@@ -99,8 +99,8 @@ def direction_mixture(
 
     Raises:
         SettingError: naming what is wrong: shapes, half precision, values that are not finite, weights that are not
-            positive, covariances that are not symmetric positive definite, or factors that are not lower triangular with
-            a positive diagonal.
+            positive, covariances that are not symmetric positive definite, or factors that are not lower triangular
+            with a positive diagonal.
     """
     one = (covariances is None) != (cholesky is None)
     require(one, "covariances", covariances, "either covariances or cholesky, not both")
