@@ -91,6 +91,7 @@ FLOORS = (
     ("tuning", "episode"),
     ("sim",),
     ("commands",),
+    ("envs",),
     ("cli", "__main__"),
 )
 FLOOR = {module: floor for floor, modules in enumerate(FLOORS) for module in modules}
@@ -98,13 +99,15 @@ FLOOR = {module: floor for floor, modules in enumerate(FLOORS) for module in mod
 # Heavy packages, and the only modules (of the plan, or files anywhere by their stem) that may import them.
 ONLY_IN = {
     "mujoco": {"sim"},
-    "hydra": {"cli", "commands"},
-    "omegaconf": {"cli", "commands"},
+    "hydra": {"cli", "commands", "envs"},
+    "omegaconf": {"cli", "commands", "envs"},
     "matplotlib": {"pictures"},
     "cv2": {"sgbm", "sparse", "disparity_files", "commands"},
     "rich": {"cli", "commands"},
     "joblib": {"commands"},
     "skimage": {"commands"},
+    "gymnasium": {"envs"},
+    "stable_baselines3": {"envs"},
 }
 
 
@@ -213,7 +216,7 @@ def test_the_plan_is_up_to_date():
 
 
 def test_importing_torchfovea_is_light():
-    heavy = ("mujoco", "hydra", "omegaconf", "matplotlib", "cv2", "skimage", "rich", "joblib", "kornia")
+    heavy = ("mujoco", "hydra", "omegaconf", "matplotlib", "cv2", "skimage", "rich", "joblib", "kornia", "gymnasium")
     code = f"import sys, torchfovea; print([name for name in {heavy!r} if name in sys.modules])"
     done = subprocess.run(
         [sys.executable, "-c", code],

@@ -304,6 +304,7 @@ def decide(
         torch.full_like(zero, -1, dtype=torch.int64) if before is None else before.cell,
         generator,
         None if before is None else before.state,
+        memory,
     )
     score, state = evaluate(strategy, view)
     cell = choose(score, eligible, generator)

@@ -17,6 +17,7 @@ from torch import Tensor
 from torchfovea.deciding import acquisition, infomax, policies
 from torchfovea.deciding.acquisition import Generators
 from torchfovea.deciding.reward import RewardBelief, inverse_range_from_range
+from torchfovea.memory.egosphere import Memory
 from torchfovea.sensing.camera import Camera
 from torchfovea.sensing.correspondence import Budget, eye_sigma_px
 from torchfovea.sensing.layout import Retina
@@ -56,6 +57,7 @@ class View(NamedTuple):
         last: the cell chosen last, (...) int64; −1 at the start.
         generator: the source of chance, one or one for each row; None where there shall be none.
         state: what the strategy returned beside its scores the last time; None at the start.
+        memory: all that is known, (..., N), for strategies that read more than rewards; None where there is none.
     """
 
     mean: Tensor
@@ -67,6 +69,7 @@ class View(NamedTuple):
     last: Tensor
     generator: Generators | None = None
     state: Any = None
+    memory: Memory | None = None
 
 
 Strategy = Callable[[View], Tensor | tuple[Tensor, Any]]

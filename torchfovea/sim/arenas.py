@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchfovea.arena import Fixation
 from torchfovea.perception import Observer
@@ -18,7 +20,7 @@ from torchfovea.setting import require
 from torchfovea.sim.model import Scene
 from torchfovea.sim.motor import InstantMotor, Motor
 from torchfovea.sim.room import FLOOR, TARGET
-from torchfovea.sim.trace import occluded, ranges, solids_of, trace
+from torchfovea.sim.trace import occluded, ranges, solids_of, take, trace
 
 __all__ = ["GeometricArenas"]
 
@@ -47,16 +49,50 @@ class GeometricArenas:
         instant = InstantMotor() if motor is None else motor
         require(isinstance(instant, InstantMotor), "motor", type(instant).__name__, "an InstantMotor, in a batch")
         assert isinstance(instant, InstantMotor)
-        self.observer, self.sample, self.motor = observer, sample, instant
-        self.solids = solids_of(scenes, device)
-        most = max(len(scene.kind) for scene in scenes)
-        self.kind = torch.stack(
-            [torch.nn.functional.pad(scene.kind, (0, most - len(scene.kind)), value=-1) for scene in scenes]
-        ).to(device)
+        self.observer, self.sample, self.motor, self.device = observer, sample, instant, device
+        self.pool: list[Scene] = []
+        self.stands = torch.zeros(len(scenes), dtype=torch.int64)
+        self._stand(range(len(scenes)), scenes)
         self.before = torch.zeros(len(scenes), 3, dtype=torch.float64)
         seeds = range(len(scenes)) if seeds is None else seeds
         require(len(seeds) == len(scenes), "seeds", len(seeds), f"one for each of {len(scenes)} scenes")
         self.noise = [torch.Generator().manual_seed(seed) for seed in seeds]
+        self._whole: tuple[GeometricArenas, Tensor] | None = None
+
+    def _stand(self, rows: Sequence[int], scenes: Sequence[Scene]) -> None:
+        """Put rows into scenes; every scene becomes tensors once."""
+        places = {id(scene): k for k, scene in enumerate(self.pool)}
+        new = list({id(scene): scene for scene in scenes if id(scene) not in places}.values())
+        if new:
+            self.pool += new
+            places = {id(scene): k for k, scene in enumerate(self.pool)}
+            most = max(len(scene.kind) for scene in self.pool)
+            self._solids = solids_of(self.pool, self.device)
+            self._kind = torch.stack([pad(scene.kind, (0, most - len(scene.kind)), value=-1) for scene in self.pool])
+        self.stands[list(rows)] = torch.tensor([places[id(scene)] for scene in scenes])
+        self.solids = take(self._solids, self.stands.to(self.device))
+        self.kind = self._kind[self.stands].to(self.device)
+
+    def renew(self, rows: Sequence[int], scenes: Sequence[Scene], seeds: Sequence[int]) -> None:
+        """Put rows into other scenes, their heads straight ahead.
+
+        Args:
+            rows: their numbers.
+            scenes: one for each; those that were here before cost next to nothing.
+            seeds: of the rows' encoder noise.
+        """
+        self._stand(rows, scenes)
+        self.before[list(rows)] = 0
+        for row, seed in zip(rows, seeds, strict=True):
+            self.noise[row] = torch.Generator().manual_seed(seed)
+
+    def some(self, rows: Sequence[int]) -> GeometricArenas:
+        """The arenas of some rows by themselves; heads that are moved there are ours."""
+        part, index = copy(self), torch.tensor(rows)
+        part.solids, part.kind = take(self.solids, index.to(self.device)), self.kind[index.to(self.device)]
+        part.stands, part.noise, part._whole = self.stands[index], [self.noise[row] for row in rows], (self, index)
+        part.before = self.before[index]
+        return part
 
     def saccade(self, gaze: Gaze) -> Move:
         """Turn each head to its gaze, clamped to the limits; the gazes that come back are what the encoders tell."""
@@ -70,6 +106,9 @@ class GeometricArenas:
             for then, now in zip(zip(*last, strict=True), zip(*command, strict=True), strict=True)
         ]
         self.before = torch.stack(command, -1)
+        if self._whole is not None:
+            whole, rows = self._whole
+            whole.before[rows] = self.before
         error = torch.stack([torch.randn(3, generator=g, dtype=torch.float64) for g in self.noise])
         told = Gaze(*(self.before + math.radians(head.encoder_deg) * error).unbind(-1))
         return Move(told, torch.tensor(seconds, dtype=torch.float64), degrees)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,7 +18,7 @@ from torchfovea.setting import require
 from torchfovea.sim.model import Scene
 from torchfovea.sim.room import FLOOR, ROOM, Solid
 
-__all__ = ["Solids", "occluded", "ranges", "solids_of", "trace"]
+__all__ = ["Solids", "occluded", "ranges", "solids_of", "take", "trace"]
 
 
 def _tiny(dtype: torch.dtype) -> float:
@@ -107,6 +107,17 @@ def solids_of(
         rotation=tensor(yaw).T[..., None].contiguous(),
         translation=tensor(place).T[..., None].contiguous(),
     )
+
+
+def take(solids: Solids, index: Tensor) -> Solids:
+    """Some of the scenes, each as often as an index (K,) names it."""
+
+    def some(part: Any) -> Any:
+        if isinstance(part, _Group):
+            return _Group(*(p.index_select(max(p.dim() - 3, 0), index) for p in part))
+        return part.index_select(1, index)
+
+    return Solids(*map(some, solids))
 
 
 def _closed(shell: list[tuple[int, Solid]]) -> tuple[list[list[float]], list[int]]:

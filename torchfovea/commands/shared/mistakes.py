@@ -44,6 +44,8 @@ EXTRAS = {
     "skimage": "samples",
     "cma": "tune",
     "optuna": "tune",
+    "gymnasium": "rl",
+    "stable_baselines3": "ppo",
 }
 
 # settings that are gone, and what does their work

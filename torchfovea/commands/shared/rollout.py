@@ -26,7 +26,7 @@ from torchfovea.sim.arenas import GeometricArenas
 from torchfovea.sim.model import Scene
 from torchfovea.sim.truth import truth_of
 
-__all__ = ["batched", "one_episode", "prepare_episode", "roll_out", "sample_of"]
+__all__ = ["batched", "kept_scene", "one_episode", "prepare_episode", "roll_out", "sample_of"]
 
 StrategyFor = Callable[[Sequence[Truth]], Strategy]
 
@@ -105,9 +105,14 @@ def _start(settings: str, observer: Observer, seed: int) -> tuple[Memory, Tensor
     return memory, generator.get_state()
 
 
+def kept_scene(cfg: DictConfig, head: Head, seed: int) -> Scene:
+    """The scene of a seed, kept for the next call with the same settings."""
+    return _scene(OmegaConf.to_yaml(OmegaConf.masked_copy(cfg, ["scene", "trust"]), resolve=True), head, seed)
+
+
 def prepare_episode(cfg: DictConfig, observer: Observer, seed: int) -> tuple[Scene, Memory, Truth, torch.Generator]:
     """What an episode starts from; scenes and memories are kept for the next call with the same settings."""
-    scene = _scene(OmegaConf.to_yaml(OmegaConf.masked_copy(cfg, ["scene", "trust"]), resolve=True), observer.head, seed)
+    scene = kept_scene(cfg, observer.head, seed)
     generator, memory = torch.Generator().manual_seed(seed), loaded_memory(cfg, observer)
     if memory is not None:
         return scene, memory, truth_of(scene, memory.cells), generator
