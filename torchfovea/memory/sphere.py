@@ -306,8 +306,7 @@ def fix_gauge(mixture: DirectionMixture) -> DirectionMixture:
 
     (μ, L) and (cμ, cL) are one distribution of directions: an optimizer drifts along this gauge unless it is fixed.
     """
-    power = mixture.means.square().sum(-1) + mixture.cholesky.square().sum((-2, -1))
-    scale = power.rsqrt()
+    scale = (mixture.means.square().sum(-1) + mixture.cholesky.square().sum((-2, -1))).rsqrt()
     return DirectionMixture(
         mixture.logits.log_softmax(-1), mixture.means * scale[:, None], mixture.cholesky * scale[:, None, None]
     )
