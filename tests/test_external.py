@@ -106,6 +106,58 @@ def test_confidence_is_a_standard_deviation(disparity, views):
     torch.testing.assert_close(extra, torch.full_like(extra, (0.65**2 - 0.2**2) / scale**2), rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("answer", "settings"),
+    [
+        (lambda d: np.where(np.isnan(d), 1e9, -d), {"scale": -1.0, "invalid": 1e9}),
+        (lambda d: np.where(np.isnan(d), -16, np.round(256 * d)).astype(np.int32), {"scale": 1 / 256, "invalid": -16}),
+        (lambda d: torch.from_numpy(d).double(), {}),
+    ],
+    ids=["signed", "fractions", "float64"],
+)
+def test_any_sign_and_unit_is_turned_into_pixels(disparity, views, answer, settings):
+    params, retina = External(**settings), LogPolar(800)
+    found, _ = match_external(lambda left, right: answer(disparity), views, retina, params, nearest_range_m=0.5)
+    expected, _ = match_external(lambda left, right: disparity, views, retina, nearest_range_m=0.5)
+    assert torch.equal(found.valid, expected.valid) and found.valid.any() and not found.valid.all()
+    torch.testing.assert_close(found.right_px, expected.right_px, atol=0.01, rtol=0)
+
+
+def test_a_wrong_sign_or_unit_is_told(disparity, views):
+    for answer, message in (
+        (-disparity, r"disparities = -1\d\.?\d* to -1 px: expected .* by matcher\.scale=-1$"),
+        (16 * disparity, r"px: expected .* by matcher\.scale=0\.0625$"),
+    ):
+        with pytest.raises(SettingError, match=message):
+            match_external(lambda left, right, answer=answer: answer, views, nearest_range_m=0.5)
+
+
+def test_what_tells_the_worth_of_a_disparity(disparity, views):
+    """A doubt is a confidence turned round; a deviation, a variance and its logarithm say the same, at their word."""
+    sigma = np.tile(np.linspace(0.1, 1, SIZE[1], dtype=np.float32), (SIZE[0], 1))
+
+    def found(worth, **settings):
+        return match_external(lambda *pair: (disparity, worth), views, None, External(**settings), None, 0.5)[0]
+
+    expected = found(1 - sigma, least_confidence=0.3)
+    for worth, settings in (
+        (sigma, {"tells": "doubt", "least_confidence": 0.3}),
+        (sigma, {"tells": "sigma"}),
+        (sigma**2, {"tells": "variance"}),
+        (2 * np.log(sigma), {"tells": "log_variance"}),
+    ):
+        told = found(worth, **settings)
+        torch.testing.assert_close(told.right_sigma_px, expected.right_sigma_px)
+        if settings["tells"] == "doubt":
+            assert torch.equal(told.valid, expected.valid)
+    hole = sigma.copy()
+    hole[40:50] = np.nan
+    told = found(hole, tells="sigma")
+    assert not told.valid.reshape(SIZE)[40:50].any() and told.valid.any() and told.right_sigma_px.isfinite().all()
+    with pytest.raises(SettingError, match="confidence = -2 to -1: expected 0 to inf"):
+        found(sigma * 0 - 1 - (sigma > 0.5), tells="variance")
+
+
 def test_a_function_sees_both_images(disparity, images, views):
     seen = []
 
@@ -214,7 +266,9 @@ def test_bad_answers_and_settings_are_named(tmp_path, disparity, images, views):
             match_external(source, eyes, LogPolar(800))
     for name, value in {
         "sure_px": -1.0, "unsure_px": -0.5, "power": 0.0, "least_confidence": 2.0, "edge_px": 0.0,
-        "rectified_fov_deg": 170.0,
+        "rectified_fov_deg": 170.0, "scale": 0.0, "tells": "certainty",
     }.items():  # fmt: skip
         with pytest.raises(SettingError, match=f"matcher.{name}"):
             External(**{name: value})
+    with pytest.raises(SettingError, match="least_confidence = 0.5: expected 0 where the matcher tells a sigma"):
+        External(tells="sigma", least_confidence=0.5)

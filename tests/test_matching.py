@@ -14,11 +14,11 @@ from omegaconf import OmegaConf
 
 from torchfovea.commands.shared.config import conf_dir
 from torchfovea.sensing.camera import Fisheye, Pinhole, image_camera
-from torchfovea.sensing.correspondence import Budget, Disparity, eye_sigma_px
+from torchfovea.sensing.correspondence import Budget, eye_sigma_px
 from torchfovea.sensing.retina import LogPolar, Uniform
 from torchfovea.setting import SettingError
 from torchfovea.stereo.external import External
-from torchfovea.stereo.maps import match_disparity, read_disparity
+from torchfovea.stereo.maps import match_disparity, read_values
 from torchfovea.stereo.matching import match_sgbm
 from torchfovea.stereo.rig import posed, verged
 from torchfovea.stereo.sgbm import SGBM, disparity_sgbm
@@ -360,9 +360,8 @@ def test_holes_in_a_disparity_map():
 def test_reading_a_disparity_keeps_to_one_surface():
     disparity = torch.tensor([[10.0, 10.5, 30.0], [10.0, 10.5, 30.0]])
     valid = torch.tensor([[True, True, True], [True, False, True]])
-    field = Disparity(disparity, disparity, valid, PINHOLE, 0.0, 0.1)
     place = torch.tensor([[0.5, 0.0], [0.4, 0.4], [1.4, 0.0], [1.6, 0.0], [1.0, 1.0], [-2.0, 0.0], [2.0, 1.0]])
-    value, found = read_disparity(field, place, 1.0)
+    value, found = read_values(disparity, valid, place, 1.0)
     assert found.tolist() == [True, True, True, True, False, False, True]
     weights = np.array([0.6 * 0.6, 0.4 * 0.6, 0.6 * 0.4])  # the fourth neighbour is invalid
     expected = weights @ [10, 10.5, 10] / weights.sum()
@@ -383,7 +382,7 @@ def test_motorcycle_fovea_is_as_good_as_plain_matching():
     column, row = place.round().long().unbind(-1)
     expected = torch.as_tensor(true)[row, column]
     ours = 2.5 * (found.left_px - found.right_px)[:, 0]
-    theirs, there = read_disparity(plain, place, 1.0)
+    theirs, there = read_values(plain.disparity, plain.valid, place, 1.0)
     known = expected.isfinite()
     fovea = known & (found.left_px.norm(dim=-1) < 15)
     assert found.valid[known].float().mean() > 0.9 and found.valid[fovea].float().mean() > 0.98

@@ -14,16 +14,19 @@ from torchfovea.setting import SettingError, require
 __all__ = ["check_maps", "load_disparity"]
 
 
-def load_disparity(path: str | Path, setting: str = "matcher.source") -> tuple[Tensor, Tensor | None]:
+def load_disparity(
+    path: str | Path, setting: str = "matcher.source", span: tuple[float, float] = (0.0, 1.0)
+) -> tuple[Tensor, Tensor | None]:
     """A disparity map, and its confidence where the file has one.
 
     Args:
         path: NPZ with `disparity` (or one array alone) and perhaps `confidence`; NPY; PFM; or 16-bit PNG in 1/256 px
             with 0 for unknown (KITTI's).
         setting: the name the user knows the path by.
+        span: between which values a confidence lies.
 
     Returns:
-        (H, W) float32 [px], not finite where unknown; and (H, W) in [0, 1], or None.
+        (H, W) float32 [px], not finite where unknown; and the confidence (H, W), or None.
 
     Raises:
         SettingError: for a file that is missing, of another form, or whose parts do not fit.
@@ -39,7 +42,7 @@ def load_disparity(path: str | Path, setting: str = "matcher.source") -> tuple[T
         raise
     except (ValueError, OSError, IndexError, EOFError) as error:
         raise SettingError(f"{setting} = {path}: expected a disparity map ({error})") from error
-    return check_maps(disparity, confidence, None, f"{setting} = {path}")
+    return check_maps(disparity, confidence, None, f"{setting} = {path}", span)
 
 
 def _npz(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
@@ -79,13 +82,13 @@ def _png(path: Path) -> tuple[np.ndarray, None]:
 
 
 def check_maps(
-    disparity: Any, confidence: Any, size: tuple[int, int] | None, where: str
+    disparity: Any, confidence: Any, size: tuple[int, int] | None, where: str, span: tuple[float, float] = (0.0, 1.0)
 ) -> tuple[Tensor, Tensor | None]:
     """A matcher's answer as float32 tensors.
 
     Raises:
-        SettingError: unless the disparity is (H, W) numbers, of the given size if any, and the confidence is alike, in
-            [0, 1].
+        SettingError: unless the disparity is (H, W) numbers, of the given size if any, and the confidence is alike,
+            within its span; a standard deviation or a variance may also be NaN.
     """
     maps: list[Tensor] = []
     for name, value in (("disparity", disparity), ("confidence", confidence)):
@@ -98,6 +101,8 @@ def check_maps(
         require(array.dtype.kind in "fiu", f"{where}: {name}.dtype", array.dtype, "numbers")
         maps.append(torch.from_numpy(np.array(array, dtype=np.float32, order="C")))
         size = array.shape
-    bounded = bool(((maps[1] >= 0) & (maps[1] <= 1)).all())
-    require(bounded, f"{where}: confidence", f"{maps[1].min():g} to {maps[1].max():g}", "0 to 1")
+    inside = (maps[1] >= span[0]) & (maps[1] <= span[1])
+    inside |= maps[1].isnan() & (span[1] > 1)
+    found = f"{maps[1].min():g} to {maps[1].max():g}"
+    require(bool(inside.all()), f"{where}: confidence", found, f"{span[0]:g} to {span[1]:g}")
     return maps[0], maps[1]

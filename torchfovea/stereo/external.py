@@ -4,7 +4,8 @@ A confidence c from 0 to 1, where there is one, becomes a standard deviation of 
 
     σ(c) = sure_px + (unsure_px − sure_px)(1 − c)^power,
 
-which adds to the right eye's budget; without a confidence c = 1. Nothing here is differentiable.
+which adds to the right eye's budget times `Budget.claim`; without a confidence c = 1. A matcher that tells a standard
+deviation or a variance is taken at its word. Nothing here is differentiable.
 """
 
 from __future__ import annotations
@@ -34,22 +35,37 @@ __all__ = ["DisparityFunction", "External", "load_matcher", "match_external"]
 DisparityFunction = Callable[[np.ndarray, np.ndarray], Any]
 """From the left and right images, float32 (H, W, 3) in [0, 1], to disparity (H, W) [px] or (disparity, confidence)."""
 
+# what the second of a matcher's two maps may tell, and between which values
+TELLS = {
+    "confidence": (0.0, 1.0), "doubt": (0.0, 1.0), "sigma": (0.0, math.inf), "variance": (0.0, math.inf),
+    "log_variance": (-math.inf, math.inf),
+}  # fmt: skip
+
 
 @dataclass(frozen=True)
 class External:
     """What is made of a foreign matcher's answer.
 
     Attributes:
+        scale: what a disparity is multiplied by to become x_left − x_right in pixels: −1 for a flow from left to right,
+            1/16 for OpenCV's whole numbers.
+        invalid: the number that stands for no disparity, before the scale; null: none does. NaN and infinite values
+            never are one.
+        tells: what the second map is, where there is one: confidence (0 to 1, higher is better), doubt (0 to 1, higher
+            is worse), sigma [image px], variance [image px²] or log_variance.
         sure_px: standard deviation of a disparity of confidence 1, beside the budget [image px].
         unsure_px: that of confidence 0.
         power: of the law between them.
-        least_confidence: less is invalid.
+        least_confidence: less is invalid; a doubt's is 1 less the doubt.
         edge_px: neighbouring disparities further apart than this are different surfaces, never averaged.
         rectified_fov_deg: widest rectified view of verged eyes; what lies beyond is masked.
         refine: let the images move what is read at the RFs by the last part of a pixel, as the other matchers do; for
             matchers that prefer whole pixels. Either way they tell its noise.
     """
 
+    scale: float = 1.0
+    invalid: float | None = None
+    tells: str = "confidence"
     sure_px: float = 0.0
     unsure_px: float = 1.0
     power: float = 1.0
@@ -60,6 +76,9 @@ class External:
 
     def __post_init__(self) -> None:
         """Raise SettingError for impossible numbers."""
+        scaled = self.scale != 0 and math.isfinite(self.scale)
+        require(scaled, "matcher.scale", self.scale, "a number other than 0, negative to turn the sign round")
+        require(self.tells in TELLS, "matcher.tells", self.tells, "one of " + ", ".join(TELLS))
         require(0 <= self.sure_px < math.inf, "matcher.sure_px", self.sure_px, "0 or more pixels")
         require(
             self.sure_px <= self.unsure_px < math.inf,
@@ -69,13 +88,26 @@ class External:
         )
         require(0 < self.power < math.inf, "matcher.power", self.power, "a positive number")
         require(0 <= self.least_confidence <= 1, "matcher.least_confidence", self.least_confidence, "0 to 1")
+        certain = self.least_confidence == 0 or TELLS[self.tells] == (0.0, 1.0)
+        require(certain, "matcher.least_confidence", self.least_confidence, f"0 where the matcher tells a {self.tells}")
         require(self.edge_px > 0, "matcher.edge_px", self.edge_px, "a positive number of pixels")
         fov = self.rectified_fov_deg
         require(0 < fov <= 160, "matcher.rectified_fov_deg", fov, "more than 0 and at most 160 degrees")
 
-    def sigma_px(self, confidence: Tensor) -> Tensor:
-        """The law, (...) to (...) [image px]."""
-        return self.sure_px + (self.unsure_px - self.sure_px) * (1 - confidence.clamp(0, 1)) ** self.power
+    def confidence(self, told: Tensor) -> Tensor:
+        """Of a confidence or a doubt, (...) to (...) in [0, 1]."""
+        return 1 - told if self.tells == "doubt" else told
+
+    def sigma_px(self, told: Tensor) -> Tensor:
+        """The standard deviation of what the second map tells, (...) to (...) [image px]."""
+        if self.tells == "sigma":
+            return told
+        if self.tells == "variance":
+            return told.sqrt()
+        if self.tells == "log_variance":
+            return (told / 2).exp()
+        doubt = 1 - self.confidence(told).clamp(0, 1)
+        return self.sure_px + (self.unsure_px - self.sure_px) * doubt**self.power
 
 
 def load_matcher(source: str, setting: str = "matcher.source") -> DisparityFunction:
@@ -88,16 +120,16 @@ def load_matcher(source: str, setting: str = "matcher.source") -> DisparityFunct
     return found
 
 
-def _ask(matcher: DisparityFunction, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor | None]:
-    """Call a user's function on images (3, H, W)."""
+def _ask(matcher: DisparityFunction, shown: Tensor, span: tuple[float, float]) -> tuple[Tensor, Tensor | None]:
+    """Call a user's function on images (2, 3, H, W)."""
     name = getattr(matcher, "__name__", type(matcher).__name__)
-    views = [np.ascontiguousarray(view.detach().cpu().float().movedim(0, -1).numpy()) for view in (left, right)]
+    views = [np.ascontiguousarray(view.detach().cpu().float().movedim(0, -1).numpy()) for view in shown]
     answer = matcher(*views)
     pair = answer if isinstance(answer, tuple) else (answer, None)
     require(
         len(pair) == 2, f"{name}(left, right)", f"{len(pair)} values", "a disparity, or a disparity and a confidence"
     )
-    return check_maps(pair[0], pair[1], (left.shape[-2], left.shape[-1]), f"{name}(left, right)")
+    return check_maps(pair[0], pair[1], (shown.shape[-2], shown.shape[-1]), f"{name}(left, right)", span)
 
 
 def match_external(
@@ -113,7 +145,7 @@ def match_external(
 
     Args:
         source: a function, or its name ``package.module:function``; of a rectified pair also a file (`load_disparity`).
-            It sees a rectified pair's images, and of two eyes the rectified views that the retinas keep.
+            A function sees a rectified pair's images, and of two eyes the rectified views that the retinas keep.
         views: the images with their cameras.
         retina: of both; None, for a rectified pair, takes every pixel for an RF.
         params: what is made of the answer.
@@ -126,7 +158,8 @@ def match_external(
         come from.
 
     Raises:
-        SettingError: for what cannot be read, called or fitted to the images.
+        SettingError: for what cannot be read, called or fitted to the images, and for disparities of the wrong sign or
+            unit: most of them behind the eyes, or further than the image is wide.
     """
     params, budget = params or External(), views.told(budget)
     span = checked_range(nearest_range_m, farthest_range_m)
@@ -138,13 +171,18 @@ def match_external(
     if not views.rectified:
         left_px, right_px, ahead = frame.seen(shown)
         shown, frame = frame.kept(shown, left_px, right_px), frame._replace(looks=frame.looked_at(left_px, ahead))
-    disparity, confidence = _answer(source, shown, views.rectified)
-    disparity = disparity.to(shown)
-    trusted = torch.isfinite(disparity)
+    disparity, worth = _answer(source, shown, views.rectified, TELLS[params.tells])
+    trusted = (
+        torch.isfinite(disparity) if params.invalid is None else disparity.isfinite() & (disparity != params.invalid)
+    )
+    disparity, trusted = (params.scale * disparity).to(shown), trusted.to(shown.device)
     trusted = trusted if frame.looks is None else trusted & frame.looks
-    if confidence is not None:
-        confidence = confidence.to(shown)
-        trusted &= confidence >= params.least_confidence
+    _check_sign(disparity[trusted] + views.doffs_px, shown.shape[-1], params.scale)
+    if worth is not None:
+        worth = worth.to(shown)
+        trusted &= worth.isfinite()
+        if params.least_confidence > 0:
+            trusted &= params.confidence(worth) >= params.least_confidence
     disparity = torch.where(trusted, disparity, torch.zeros_like(disparity))
     left, right = grey_of(shown)[:, 0]
     trusted, rival_px = undisputed(left, right, disparity, trusted)
@@ -154,32 +192,46 @@ def match_external(
     )
     matches, found = read_map(field, frame, budget, span, params.edge_px, views.grey().detach(), params.refine)
     place, scale = frame.place(matches.left_px)[0], views.scale(retina)
-    return _doubt(matches, confidence, place, scale, params, budget.claim), found
+    return _doubt(matches, worth, place, scale, params, budget.claim), found
 
 
-def _answer(source: str | Path | DisparityFunction, shown: Tensor, files: bool) -> tuple[Tensor, Tensor | None]:
-    """The disparity and the confidence (H, W) of views (2, 3, H, W), from a file where it may be one, or a function."""
+def _check_sign(shift: Tensor, width: int, scale: float) -> None:
+    """Refuse disparities (M,) [px] most of which no point has: behind the eyes, or further than the image is wide."""
+    if shift.numel() == 0:
+        return
+    span = f"{float(shift.min()):.4g} to {float(shift.max()):.4g} px"
+    behind, beyond = (float(those.float().mean()) for those in (shift < 0, shift > width))
+    form = "x_left - x_right in pixels, which is positive; {} by matcher.scale={:g}"
+    require(behind <= 0.5, "disparities", span, form.format("turn the sign round", -scale))
+    require(beyond <= 0.5, "disparities", span, form.format("of sixteenths they are made", scale / 16))
+
+
+def _answer(
+    source: str | Path | DisparityFunction, shown: Tensor, files: bool, span: tuple[float, float]
+) -> tuple[Tensor, Tensor | None]:
+    """The disparity and its worth (H, W) of views (2, 3, H, W), from a file where it may be one, or a function."""
     if isinstance(source, str | Path) and (isinstance(source, Path) or ":" not in source or Path(source).exists()):
         require(
             files, "matcher.source", source, "package.module:function; a file has the disparity of a rectified pair"
         )
-        maps = load_disparity(source)
-        return check_maps(*maps, (shown.shape[-2], shown.shape[-1]), f"matcher.source = {source}")
+        maps = load_disparity(source, span=span)
+        return check_maps(*maps, (shown.shape[-2], shown.shape[-1]), f"matcher.source = {source}", span)
     matcher = load_matcher(source) if isinstance(source, str) else source
     assert not isinstance(matcher, Path)
     require(callable(matcher), "matcher.source", matcher, "a file or a function")
-    return _ask(matcher, *shown)
+    return _ask(matcher, shown, span)
 
 
 def _doubt(
-    matches: Correspondences, confidence: Tensor | None, place: Tensor, scale: float, params: External, claim: float
+    matches: Correspondences, worth: Tensor | None, place: Tensor, scale: float, params: External, claim: float
 ) -> Correspondences:
-    """Add the confidences' share to the right eye's standard deviations; `place` (N, 2) in the map's pixels."""
-    if confidence is None:
+    """Add the second map's share to the right eye's standard deviations; `place` (N, 2) in the map's pixels."""
+    if worth is None:
         sigma = torch.full_like(matches.right_sigma_px, params.sure_px)
     else:
-        height, width = confidence.shape
+        height, width = worth.shape
         near = place.round().long()
         column, row = near[..., 0].clamp(0, width - 1), near[..., 1].clamp(0, height - 1)
-        sigma = params.sigma_px(confidence.to(place)[row, column])
+        sigma = params.sigma_px(worth.to(place)[row, column])
+        sigma = torch.where(sigma.isfinite(), sigma, torch.zeros_like(sigma))
     return matches._replace(right_sigma_px=torch.hypot(matches.right_sigma_px, claim * sigma / scale))

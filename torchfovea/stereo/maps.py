@@ -30,7 +30,7 @@ from torchfovea.stereo.readings import refine_reading
 from torchfovea.stereo.rectification import RectifiedPair, image_frame
 from torchfovea.stereo.views import Views
 
-__all__ = ["checked_range", "correspondences", "match_disparity", "read_disparity", "read_map"]
+__all__ = ["checked_range", "correspondences", "match_disparity", "read_map", "read_values"]
 
 
 def match_disparity(
@@ -104,7 +104,7 @@ def read_map(
 
     def read(px: Tensor) -> tuple[Tensor, Tensor]:
         place, shown = frame.place(px)
-        shift, found = read_disparity(field, place, edge_px)
+        shift, found = read_values(field.disparity, field.valid, place, edge_px)
         return shift + doffs, found & shown
 
     left_px = _fields(field, retina)
@@ -127,19 +127,19 @@ def read_map(
     return correspondences(left_px, right_px, found, retina, budget, clues), field._replace(clues=clues)
 
 
-def read_disparity(disparity: Disparity, place: Tensor, edge_px: float) -> tuple[Tensor, Tensor]:
-    """The disparity at places (N, 2) of its view, and where there is one.
+def read_values(values: Tensor, valid: Tensor, place: Tensor, edge_px: float) -> tuple[Tensor, Tensor]:
+    """A disparity map (H, W) at places (N, 2) of its view, and where there is one.
 
     Bilinear among the four pixels around the place that are valid and on the same surface as the nearest of them, which
     must be valid itself: nothing is averaged over a depth edge.
     """
-    height, width = disparity.disparity.shape
+    height, width = values.shape
     x, y = place.unbind(-1)
     column, row = x.round(), y.round()
     on = (column >= 0) & (column <= width - 1) & (row >= 0) & (row <= height - 1)
     zero = torch.zeros_like(x)
     nearest = torch.where(on, row, zero).long() * width + torch.where(on, column, zero).long()
-    values, valid = disparity.disparity.flatten(), disparity.valid.flatten()
+    values, valid = values.flatten(), valid.flatten()
     reference, found = values[nearest], on & valid[nearest]
     left, top = x.floor(), y.floor()
     total, weighted = zero, zero
