@@ -177,7 +177,7 @@ def match_external(
     )
     disparity, trusted = (params.scale * disparity).to(shown), trusted.to(shown.device)
     trusted = trusted if frame.looks is None else trusted & frame.looks
-    _check_sign(disparity[trusted] + views.doffs_px, shown.shape[-1], params.scale)
+    _check_sign(disparity[trusted], views.doffs_px, shown.shape[-1], params.scale)
     if worth is not None:
         worth = worth.to(shown)
         trusted &= worth.isfinite()
@@ -195,15 +195,15 @@ def match_external(
     return _doubt(matches, worth, place, scale, params, budget.claim), found
 
 
-def _check_sign(shift: Tensor, width: int, scale: float) -> None:
+def _check_sign(disparity: Tensor, doffs_px: float, width: int, scale: float) -> None:
     """Refuse disparities (M,) [px] most of which no point has: behind the eyes, or further than the image is wide."""
-    if shift.numel() == 0:
+    if disparity.numel() == 0:
         return
-    span = f"{float(shift.min()):.4g} to {float(shift.max()):.4g} px"
-    behind, beyond = (float(those.float().mean()) for those in (shift < 0, shift > width))
-    form = "x_left - x_right in pixels, which is positive; {} by matcher.scale={:g}"
+    span = f"{float(disparity.min()):.4g} to {float(disparity.max()):.4g} px"
+    behind, beyond = (float(those.float().mean()) for those in (disparity < -doffs_px, disparity > width))
+    form = "x_left - x_right in pixels, of points ahead; {} by matcher.scale={:g}"
     require(behind <= 0.5, "disparities", span, form.format("turn the sign round", -scale))
-    require(beyond <= 0.5, "disparities", span, form.format("of sixteenths they are made", scale / 16))
+    require(beyond <= 0.5, "disparities", span, form.format("sixteenths become pixels", scale / 16))
 
 
 def _answer(
