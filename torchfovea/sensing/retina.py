@@ -12,15 +12,18 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from operator import index
+from typing import NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchfovea.finite import require_finite
 from torchfovea.gaussian import columns
 from torchfovea.sensing.layout import LogPolar, Retina, Uniform, cortical
-from torchfovea.sensing.sampling import place, read, sampling, wide
+from torchfovea.sensing.sampling import constant, place, read, sampling, wide
 from torchfovea.sensing.triangles import from_triangles
 from torchfovea.setting import require
 
@@ -31,41 +34,50 @@ def fovea(image: Tensor, gaze_px: Tensor | None, retina: Retina, scale: float | 
     """Look at an image with a retina: every RF's average over its own footprint.
 
     Args:
-        image: (B, C, H, W), floating point, finite. One image (B = 1) may be looked at with many gazes.
-        gaze_px: (B, 2), the image pixel (column, row) where the optical axis lands; None for the image's middle.
+        image: (B, C, H, W), floating point, finite.
+        gaze_px: the image pixel (column, row) where the optical axis lands: (B, 2), one for each image, or with B = 1
+            any number of them for the one image; (B, G, 2), G for each; None for the image's middle.
         retina: the layout.
         scale: image pixels per retinal pixel; None lets the retina span the image's shorter side.
 
     Returns:
-        (B, C, N), in the image's type; half precision is read in float32, where a place is not rounded to whole pixels.
-        An RF that looks outside the image gets the nearest border's value; `covered` tells which do not.
+        (B, C, N), for gazes (B, G, 2) (B, G, C, N), in the image's type; half precision is read in float32, where a
+        place is not rounded to whole pixels. An RF that looks outside the image gets the nearest border's value;
+        `covered` tells which do not.
 
     Raises:
-        SettingError: for shapes or types that do not fit, or an image or gaze with NaN or infinite values.
+        SettingError: for shapes or types that do not fit; for NaN or infinite values on the CPU (`require_finite`).
 
-    Differentiable in the image and the gaze (bilinear: piecewise smooth in the gaze).
+    Differentiable in the image and the gaze (bilinear: piecewise smooth in the gaze). For torch.compile one graph, and
+    clean for vmap.
     """
-    scale = _checked_scale(image.shape[-2:], retina, scale)
+    # a compiler's sizes may be symbols; a plan is made for numbers
+    height, width = index(image.shape[-2]), index(image.shape[-1])
+    scale = _checked_scale((height, width), retina, scale)
     require(image.dim() == 4 and image.numel() > 0, "image.shape", tuple(image.shape), "(B, C, H, W)")
     require(image.is_floating_point(), "image.dtype", image.dtype, "a floating-point type")
     given, image = image.dtype, image.to(wide(image.dtype))
-    require(bool(image.detach().sum().isfinite()), "image", "NaN or infinite values", "finite values")
-    height, width = image.shape[-2:]
+    require_finite(image, "image", "finite values")
     plan = sampling(retina, height, width, scale, image.device, image.dtype)
     if gaze_px is None:
         maps = plan.middle
     else:
         _check_gaze(gaze_px)
-        fits = len(image) in (1, len(gaze_px))
-        require(fits, "gaze_px.shape", tuple(gaze_px.shape), f"({len(image)}, 2), one per image")
-        maps = place(plan, gaze_px.to(image))
+        fits = len(image) == len(gaze_px) or (len(image) == 1 and gaze_px.dim() == 2)
+        form = f"({len(image)}, 2) or ({len(image)}, G, 2), one or several per image"
+        require(fits, "gaze_px.shape", tuple(gaze_px.shape), form)
+        rows = gaze_px if gaze_px.dim() == 3 else gaze_px[None] if len(image) == 1 else gaze_px[:, None]
+        maps = place(plan, rows.to(image))
     values = read(image, maps[..., : plan.above])
-    if plan.levels == 0:
-        return values.to(given)
-    higher = read(_pyramid(image, plan.levels), maps[..., plan.above :])
-    fine, coarse = higher.split([retina.count - plan.above, retina.count - plan.first], -1)
-    blended = torch.lerp(torch.cat([values[..., plan.first :], fine], -1), coarse, plan.blend)
-    return torch.cat([values[..., : plan.first], blended], -1).to(given)
+    if plan.levels > 0:
+        higher = read(_pyramid(image, plan.levels), maps[..., plan.above :])
+        fine, coarse = higher.split([plan.fields - plan.above, plan.fields - plan.first], -1)
+        blended = torch.lerp(torch.cat([values[..., plan.first :], fine], -1), coarse, plan.blend)
+        values = torch.cat([values[..., : plan.first], blended], -1)
+    values = values.to(given)  # (B, C, G, N)
+    if gaze_px is not None and gaze_px.dim() == 3:
+        return values.transpose(1, 2)
+    return values[0].transpose(0, 1) if len(image) == 1 else values[:, :, 0]
 
 
 def covered(retina: Retina, size: tuple[int, int], gaze_px: Tensor | None, scale: float | None = None) -> Tensor:
@@ -74,11 +86,11 @@ def covered(retina: Retina, size: tuple[int, int], gaze_px: Tensor | None, scale
     Args:
         retina: the layout.
         size: the image's height and width [px].
-        gaze_px: (B, 2) as in `fovea`; None for the image's middle (B = 1).
+        gaze_px: (B, 2) or (B, G, 2) as in `fovea`; None for the image's middle (B = 1).
         scale: image pixels per retinal pixel, as in `fovea`.
 
     Returns:
-        bool (B, N): whether the RF's centre lies on a pixel of the image.
+        bool (B, N) or (B, G, N): whether the RF's centre lies on a pixel of the image.
     """
     scale = _checked_scale(size, retina, scale)
     height, width = size
@@ -86,7 +98,7 @@ def covered(retina: Retina, size: tuple[int, int], gaze_px: Tensor | None, scale
         gaze_px = torch.tensor([[(width - 1) / 2, (height - 1) / 2]])
     _check_gaze(gaze_px)
     dtype = gaze_px.dtype if gaze_px.is_floating_point() else torch.get_default_dtype()
-    seen_px = gaze_px.to(dtype)[:, None] + scale * retina.centers_px(gaze_px.device, dtype)
+    seen_px = gaze_px.to(dtype)[..., None, :] + scale * retina.centers_px(gaze_px.device, dtype)
     return ((seen_px >= -0.5) & (seen_px <= seen_px.new_tensor([width - 0.5, height - 0.5]))).all(-1)
 
 
@@ -108,25 +120,25 @@ def interpolate(values: Tensor, retina: Retina, px: Tensor) -> Tensor:
     Raises:
         SettingError: for another number of values.
 
-    Differentiable in the values, not in the places.
+    Differentiable in the values and the places (bilinear: piecewise smooth in the places). For torch.compile one graph
+    and clean for vmap, but for layouts of a user's own.
     """
-    require(
-        values.dim() == 3 and values.shape[-1] == retina.count and values.is_floating_point(),
-        "values.shape",
-        (*values.shape, values.dtype),
-        f"(B, C, {retina.count}), floating point",
-    )
-    flat = px.detach().to(values).reshape(-1, 2)
+    count = count_of(retina)
+    fits = values.dim() == 3 and values.shape[-1] == count and values.is_floating_point()
+    require(fits, "values.shape", (*values.shape, values.dtype), f"(B, C, {count}), floating point")
+    given, values = values.dtype, values.to(wide(values.dtype))
+    flat = px.to(values).reshape(-1, 2)
     if isinstance(retina, Uniform):
         out = _from_lattice(values, retina, flat)
     elif not isinstance(retina, LogPolar):
         out = from_triangles(values, retina.centers_px("cpu", torch.float64), flat)
     else:
-        out = _from_rings(values, retina, flat)
-        if retina.fovea_count:
+        rings = ring_numbers(retina)
+        out = _from_rings(values, rings, flat)
+        if rings.fovea_count:
             inside = flat[:, 0] ** 2 + flat[:, 1] ** 2 < retina.rho_min_px**2
-            out = torch.where(inside, _from_lattice(values[..., : retina.fovea_count], retina, flat), out)
-    return out.reshape(*values.shape[:2], *px.shape[:-1])
+            out = torch.where(inside, _from_lattice(values[..., : rings.fovea_count], retina, flat), out)
+    return out.reshape(*values.shape[:2], *px.shape[:-1]).to(given)
 
 
 def reconstruct(
@@ -146,12 +158,14 @@ def reconstruct(
     Raises:
         SettingError: for another number of values or an impossible size.
 
-    Differentiable in the values.
+    Differentiable in the values. Half precision is worked out in float32.
     """
     height, width = (size_px, size_px) if isinstance(size_px, int) else size_px
     scale = _checked_scale((height, width), retina, scale)
-    x = (torch.arange(width, device=values.device, dtype=values.dtype) - (width - 1) / 2) / scale
-    y = (torch.arange(height, device=values.device, dtype=values.dtype) - (height - 1) / 2) / scale
+    x, y = (
+        (torch.arange(side, device=values.device, dtype=wide(values.dtype)) - (side - 1) / 2) / scale
+        for side in (width, height)
+    )
     px = columns(*torch.broadcast_tensors(x, y[:, None]))
     mask = retina.inside(px)
     image = interpolate(values, retina, px)
@@ -167,8 +181,9 @@ def _checked_scale(size: tuple[int, ...] | torch.Size, retina: Retina, scale: fl
 
 
 def _check_gaze(gaze_px: Tensor) -> None:
-    require(gaze_px.dim() == 2 and gaze_px.shape[-1] == 2, "gaze_px.shape", tuple(gaze_px.shape), "(B, 2)")
-    require(bool(gaze_px.detach().isfinite().all()), "gaze_px", "NaN or infinite values", "finite pixels")
+    fits = gaze_px.dim() in (2, 3) and gaze_px.shape[-1] == 2
+    require(fits, "gaze_px.shape", tuple(gaze_px.shape), "(B, 2) or (B, G, 2)")
+    require_finite(gaze_px, "gaze_px", "finite pixels")
 
 
 def halve(image: Tensor) -> Tensor:
@@ -200,42 +215,70 @@ def _pyramid(image: Tensor, levels: int) -> Tensor:
     return torch.cat([F.pad(level, (0, width - level.shape[-1])) for level in pyramid], -2)
 
 
-def _from_rings(values: Tensor, retina: LogPolar, px: Tensor) -> Tensor:
+class _Rings(NamedTuple):
+    """A log-polar retina's numbers."""
+
+    shape: tuple[int, int]
+    fovea_count: int
+    innermost_px: float
+    growth: float
+
+
+@constant
+def ring_numbers(retina: LogPolar) -> _Rings:
+    innermost = retina.rho_min_px * math.sqrt(retina.base)
+    return _Rings(retina.shape, retina.fovea_count, innermost, math.log(retina.base))
+
+
+@constant
+def count_of(retina: Retina) -> int:
+    return retina.count
+
+
+def _from_rings(values: Tensor, rings: _Rings, px: Tensor) -> Tensor:
     """(B, C, N) at px (P, 2)."""
-    sectors = retina.sectors
-    image = cortical(values, retina)
+    sectors, innermost = rings.shape[1], rings.innermost_px
+    image = values[..., rings.fovea_count :].unflatten(-1, rings.shape)
     image = torch.cat([image[..., :1, :].mean(-1, keepdim=True).expand(*image.shape[:2], 1, sectors), image], -2)
     image = torch.cat([image[..., -1:], image, image[..., :1]], -1)
-    innermost = retina.rho_min_px * math.sqrt(retina.base)
     x, y = px.unbind(-1)
-    rho = (x * x + y * y).sqrt()
-    ring = torch.log(rho.clamp(min=innermost) / innermost) / math.log(retina.base)
+    square = x * x + y * y
+    # on the axis there is no direction; neither the root nor the angle has a gradient there
+    somewhere = square > 0
+    rho = torch.where(somewhere, square, 1.0).sqrt() * somewhere
+    ring = torch.log(rho.clamp(min=innermost) / innermost) / rings.growth
     # row 0 is ring 0's mean, at the centre; a uniform fovea stands in its place
-    inward = torch.zeros_like(rho) if retina.fovea_count else (rho / innermost).clamp(max=1) - 1
+    inward = torch.zeros_like(rho) if rings.fovea_count else (rho / innermost).clamp(max=1) - 1
     row = ring + inward + 1
-    angle = torch.atan2(y, x)
+    angle = torch.atan2(y, torch.where(somewhere, x, 1.0))
     column = torch.remainder(angle * (sectors / (2 * math.pi)), sectors) + 0.5
     return _bilinear(image, column, row)
 
 
 def _from_lattice(values: Tensor, retina: LogPolar | Uniform, px: Tensor) -> Tensor:
     """(B, C, N) of a uniform retina, or of a uniform fovea, at px (P, 2)."""
-    index, axis, pitch = _dense(retina, values.device)
-    return _bilinear(values[..., index], px[:, 0] / pitch + axis[0], px[:, 1] / pitch + axis[1])
+    shown, axis, pitch = lattice_image(retina, values.device)
+    return _bilinear(values[..., shown], px[:, 0] / pitch + axis[0], px[:, 1] / pitch + axis[1])
 
 
 def _bilinear(image: Tensor, column: Tensor, row: Tensor) -> Tensor:
     """(B, C, H, W) at (P,) columns and rows; the border's value beyond it."""
     height, width = image.shape[-2:]
-    return read(image, torch.stack([column * (2 / (width - 1)) - 1, row * (2 / (height - 1)) - 1])[:, None])
+    maps = torch.stack([column * (2 / (width - 1)) - 1, row * (2 / (height - 1)) - 1])
+    return read(image, maps[:, None, None])[:, :, 0]
 
 
-@lru_cache(maxsize=64)
-def _dense(retina: LogPolar | Uniform, device: torch.device) -> tuple[Tensor, tuple[float, float], float]:
+@constant
+def lattice_image(retina: LogPolar | Uniform, device: torch.device) -> tuple[Tensor, tuple[float, float], float]:
     """The square image that holds a disc's lattice: which RF each pixel shows, the axis' column and row, the pitch.
 
     Corners show the nearest RF of their row.
     """
+    return _lattice_image(retina, device)
+
+
+@lru_cache(maxsize=64)
+def _lattice_image(retina: LogPolar | Uniform, device: torch.device) -> tuple[Tensor, tuple[float, float], float]:
     if isinstance(retina, Uniform):
         pitch, (places, axis) = retina.pitch_px, retina.lattice
     else:
@@ -243,11 +286,10 @@ def _dense(retina: LogPolar | Uniform, device: torch.device) -> tuple[Tensor, tu
         fine = retina.centers_px("cpu", torch.float64)[: retina.fovea_count].numpy()
         places = np.rint(fine / pitch + np.array(axis)).astype(int)
     corner = places.min(0)
-    columns, rows = np.ptp(places, axis=0) + 1
-    index = np.full((rows, columns), -1)
-    index[tuple((places - corner).T[::-1])] = np.arange(len(places))
-    for row in index:
+    shown = np.full((np.ptp(places, axis=0) + 1)[::-1], -1)
+    shown[tuple((places - corner).T[::-1])] = np.arange(len(places))
+    for row in shown:
         (filled,) = np.nonzero(row >= 0)
         row[: filled[0]], row[filled[-1] + 1 :] = row[filled[0]], row[filled[-1]]
     with torch.inference_mode(False):
-        return torch.as_tensor(index).to(device), (axis[0] - corner[0], axis[1] - corner[1]), pitch
+        return torch.as_tensor(shown).to(device), (axis[0] - corner[0], axis[1] - corner[1]), pitch

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -12,7 +13,9 @@ from torch import Tensor
 
 from torchfovea.sensing.layout import Retina
 
-__all__ = ["Sampling", "place", "read", "sampling", "wide"]
+__all__ = ["Sampling", "constant", "place", "read", "sampling", "wide"]
+
+F = TypeVar("F", bound=Callable[..., Any])
 
 
 class Sampling(NamedTuple):
@@ -24,15 +27,16 @@ class Sampling(NamedTuple):
     pyramid for the others.
     """
 
+    fields: int  # N
     levels: int  # above the image
     first: int  # the first RF that needs two levels
     above: int  # the first RF that does not read the image itself
     blend: Tensor  # (N − first,), weight of the coarser level
-    maps: Tensor  # (2, 1, P), for a gaze at the image's pixel (0, 0)
-    gain: Tensor  # (2, 1, P), motion of the place per pixel of gaze
-    low: Tensor  # (2, 1, P), centres of the level's border pixels
-    high: Tensor  # (2, 1, P)
-    middle: Tensor  # (2, 1, P), the places for a gaze at the image's middle
+    maps: Tensor  # (2, 1, 1, P), for a gaze at the image's pixel (0, 0)
+    gain: Tensor  # (2, 1, 1, P), motion of the place per pixel of gaze
+    low: Tensor  # (2, 1, 1, P), centres of the level's border pixels
+    high: Tensor  # (2, 1, 1, P)
+    middle: Tensor  # (2, 1, 1, P), the places for a gaze at the image's middle
 
 
 def wide(dtype: torch.dtype) -> torch.dtype:
@@ -40,28 +44,43 @@ def wide(dtype: torch.dtype) -> torch.dtype:
     return torch.promote_types(dtype, torch.float32)
 
 
+def constant(function: F) -> F:
+    """Mark a function whose result depends on constants alone, so that torch.compile keeps it instead of tracing it.
+
+    As `torch.compiler.assume_constant_result` does, whose import takes seconds.
+    """
+    function._dynamo_marked_constant = True  # type: ignore[attr-defined]
+    return function
+
+
 def place(plan: Sampling, gaze_px: Tensor) -> Tensor:
-    """Places (2, B, P) for gazes (B, 2), kept within their level's border."""
-    maps = torch.addcmul(plan.maps, gaze_px.mT[..., None], plan.gain)
+    """Places (2, B, G, P) for gazes (B, G, 2), kept within their level's border."""
+    maps = torch.addcmul(plan.maps, gaze_px.movedim(-1, 0)[..., None], plan.gain)
     return torch.maximum(torch.minimum(maps, plan.high), plan.low)
 
 
 def read(image: Tensor, maps: Tensor) -> Tensor:
-    """(B, C, P) of an image (B or 1, C, H, W) at places (2, B or 1, P), the border's value beyond it."""
+    """(B, C, G, P) of images (B, C, H, W) at places (2, B or 1, G, P), the border's value beyond it."""
     # kornia takes as long to import as this whole package; only who looks needs it
     from kornia.geometry.transform import remap
 
-    one = len(image) == 1  # many gazes at one image are rows of one map
-    x, y = maps[:, None] if one else maps[:, :, None]
-    seen = remap(image, x, y, padding_mode="border", align_corners=True, normalized_coordinates=True)
-    return seen[0].transpose(0, 1) if one else seen[:, :, 0]
+    x, y = maps
+    seen: Tensor = remap(image, x, y, padding_mode="border", align_corners=True, normalized_coordinates=True)
+    return seen
 
 
-@lru_cache(maxsize=32)
+@constant
 def sampling(
     retina: Retina, height: int, width: int, scale: float, device: torch.device, dtype: torch.dtype
 ) -> Sampling:
     """The plan of a retina on images of one size; built once."""
+    return _sampling(retina, height, width, scale, device, dtype)
+
+
+@lru_cache(maxsize=32)
+def _sampling(
+    retina: Retina, height: int, width: int, scale: float, device: torch.device, dtype: torch.dtype
+) -> Sampling:
     with torch.inference_mode(False), torch.no_grad():
         centers = retina.centers_px("cpu", torch.float64)
         level = (torch.log2(retina.width_px(centers) * scale) - 1).numpy()
@@ -84,7 +103,7 @@ def sampling(
         # a pixel's side spans 2/(extent − 1) of these coordinates; along one pixel any coordinate will do
         unit = 2 / np.maximum(np.array(extents)[which] - 1, 1)
         maps, gain, low, high = (
-            torch.as_tensor(np.ascontiguousarray(part.T[:, None])).to(device, dtype)
+            torch.as_tensor(np.ascontiguousarray(part.T[:, None, None])).to(device, dtype)
             for part in (
                 (px * shrink + 0.5 * shrink - 0.5 + low) * unit - 1,
                 shrink * unit,
@@ -93,7 +112,7 @@ def sampling(
             )
         )
         blend = torch.as_tensor((level - fine)[first:]).to(device, dtype)
-        plan = Sampling(levels, first, above, blend, maps, gain, low, high, middle=maps)
-        gaze_px = torch.tensor([[(width - 1) / 2, (height - 1) / 2]], device=device, dtype=dtype)
+        plan = Sampling(retina.count, levels, first, above, blend, maps, gain, low, high, middle=maps)
+        gaze_px = torch.tensor([[[(width - 1) / 2, (height - 1) / 2]]], device=device, dtype=dtype)
         # pairs side by side in memory: remap puts its x and y so, and is faster where they are
-        return plan._replace(middle=place(plan, gaze_px).permute(1, 2, 0).contiguous().permute(2, 0, 1))
+        return plan._replace(middle=place(plan, gaze_px).movedim(0, -1).contiguous().movedim(-1, 0))

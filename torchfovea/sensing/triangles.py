@@ -19,17 +19,17 @@ def from_triangles(values: Tensor, centers_px: Tensor, px: Tensor) -> Tensor:
         px: (P, 2), where the values are wanted.
 
     Returns:
-        (B, C, P). Differentiable in the values.
+        (B, C, P). Differentiable in the values and, within the triangles, in the wanted places.
     """
     centers, wanted = (np.ascontiguousarray(x.detach().cpu().double().numpy()) for x in (centers_px, px))
     mesh = Delaunay(centers)
     triangle = mesh.find_simplex(wanted)
     turn = mesh.transform[triangle]
-    two = np.einsum("pij,pj->pi", turn[:, :2], wanted - turn[:, 2])
-    weight = np.concatenate([two, 1 - two.sum(-1, keepdims=True)], -1)
     corner = mesh.simplices[triangle].astype(np.int64)
-    outside = (triangle < 0) | ~np.isfinite(weight).all(-1)
-    weight[outside] = (1.0, 0.0, 0.0)
+    outside = (triangle < 0) | ~np.isfinite(turn).all((-2, -1))
+    turn[outside] = 0.0  # where only the first corner, which is the last in the mesh's coordinates, counts
     corner[outside] = cKDTree(centers).query(wanted[outside])[1][:, None]
-    index = torch.as_tensor(corner).to(values.device)
-    return (values[..., index] * torch.as_tensor(weight).to(values)).sum(-1)
+    index, turn = torch.as_tensor(corner).to(values.device), torch.as_tensor(turn).to(values)
+    two = (turn[:, :2] @ (px.to(values) - turn[:, 2])[..., None])[..., 0]
+    weight = torch.cat([two, 1 - two.sum(-1, keepdim=True)], -1)
+    return (values[..., index] * weight).sum(-1)
