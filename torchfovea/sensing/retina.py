@@ -242,23 +242,24 @@ def _from_rings(values: Tensor, rings: _Rings, px: Tensor) -> Tensor:
     image = torch.cat([image[..., :1, :].mean(-1, keepdim=True).expand(*image.shape[:2], 1, sectors), image], -2)
     image = torch.cat([image[..., -1:], image, image[..., :1]], -1)
     x, y = px.unbind(-1)
-    square = x * x + y * y
-    # on the axis there is no direction; neither the root nor the angle has a gradient there
-    somewhere = square > 0
-    rho = torch.where(somewhere, square, 1.0).sqrt() * somewhere
+    # on the axis there is no direction: the root under the floor and the angle have no gradient there
+    rho = (x * x + y * y).clamp(min=1e-30).sqrt()
     ring = torch.log(rho.clamp(min=innermost) / innermost) / rings.growth
     # row 0 is ring 0's mean, at the centre; a uniform fovea stands in its place
     inward = torch.zeros_like(rho) if rings.fovea_count else (rho / innermost).clamp(max=1) - 1
     row = ring + inward + 1
-    angle = torch.atan2(y, torch.where(somewhere, x, 1.0))
+    angle = torch.atan2(y, x)
     column = torch.remainder(angle * (sectors / (2 * math.pi)), sectors) + 0.5
     return _bilinear(image, column, row)
 
 
 def _from_lattice(values: Tensor, retina: LogPolar | Uniform, px: Tensor) -> Tensor:
     """(B, C, N) of a uniform retina, or of a uniform fovea, at px (P, 2)."""
-    shown, axis, pitch = lattice_image(retina, values.device)
-    return _bilinear(values[..., shown], px[:, 0] / pitch + axis[0], px[:, 1] / pitch + axis[1])
+    lattice = lattice_image(retina, values.device)
+    column, row = px.unbind(-1)
+    return _bilinear(
+        values[..., lattice.shown], column / lattice.pitch_px + lattice.column, row / lattice.pitch_px + lattice.row
+    )
 
 
 def _bilinear(image: Tensor, column: Tensor, row: Tensor) -> Tensor:
@@ -268,17 +269,29 @@ def _bilinear(image: Tensor, column: Tensor, row: Tensor) -> Tensor:
     return read(image, maps[:, None, None])[:, :, 0]
 
 
-@constant
-def lattice_image(retina: LogPolar | Uniform, device: torch.device) -> tuple[Tensor, tuple[float, float], float]:
-    """The square image that holds a disc's lattice: which RF each pixel shows, the axis' column and row, the pitch.
+class _Lattice(NamedTuple):
+    """The square image that holds a disc's lattice.
 
-    Corners show the nearest RF of their row.
+    Attributes:
+        shown: which RF each pixel shows; corners show the nearest RF of their row.
+        column: of the axis.
+        row: of the axis.
+        pitch_px: of the lattice.
     """
+
+    shown: Tensor
+    column: float
+    row: float
+    pitch_px: float
+
+
+@constant
+def lattice_image(retina: LogPolar | Uniform, device: torch.device) -> _Lattice:
     return _lattice_image(retina, device)
 
 
 @lru_cache(maxsize=64)
-def _lattice_image(retina: LogPolar | Uniform, device: torch.device) -> tuple[Tensor, tuple[float, float], float]:
+def _lattice_image(retina: LogPolar | Uniform, device: torch.device) -> _Lattice:
     if isinstance(retina, Uniform):
         pitch, (places, axis) = retina.pitch_px, retina.lattice
     else:
@@ -292,4 +305,5 @@ def _lattice_image(retina: LogPolar | Uniform, device: torch.device) -> tuple[Te
         (filled,) = np.nonzero(row >= 0)
         row[: filled[0]], row[filled[-1] + 1 :] = row[filled[0]], row[filled[-1]]
     with torch.inference_mode(False):
-        return torch.as_tensor(shown).to(device), (axis[0] - corner[0], axis[1] - corner[1]), pitch
+        column, line = (float(one - other) for one, other in zip(axis, corner, strict=True))
+        return _Lattice(torch.as_tensor(shown).to(device), column, line, float(pitch))
