@@ -18,7 +18,7 @@ ROOMS = {"sensing", "stereo", "memory", "deciding", "studies"}
 
 # From the ground up. A module imports from its own floor (never in a circle) or from those below it.
 FLOORS = (
-    ("setting", "files", "imported"),
+    ("setting", "files", "imported", "finite"),
     ("gaussian",),
     (
         "camera",
@@ -26,6 +26,7 @@ FLOORS = (
         "lattice",
         "layout",
         "own_layout",
+        "features",
         "sampling",
         "triangles",
         "retina",
@@ -53,6 +54,7 @@ FLOORS = (
         "sweep",
         "disparity_files",
         "external",
+        "onnx_model",
         "matchers",
         "rig",
         "views",
@@ -108,6 +110,7 @@ ONLY_IN = {
     "skimage": {"commands"},
     "gymnasium": {"envs"},
     "stable_baselines3": {"envs"},
+    "onnxruntime": {"onnx_model"},
 }
 
 

@@ -97,7 +97,7 @@ def test_vmap_is_a_loop(generator):
         assert slopes(gaze, image).isfinite().all()
 
 
-@pytest.mark.parametrize("retina", LAYOUTS, ids=str)
+@pytest.mark.parametrize("retina", LAYOUTS[1:], ids=str)  # rings and a lattice; a lattice
 def test_compilers_see_one_graph(retina, generator):
     """Forward and backward, at a second size too; and nothing is warned of."""
     torch.compiler.reset()

@@ -1,11 +1,17 @@
 """Stereo networks in files: tiny models with the public exports' signatures, against NumPy and plain functions."""
 
+import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
 
+from torchfovea.cli import main
+from torchfovea.commands.shared.build import build_match
+from torchfovea.commands.shared.config import conf_dir
 from torchfovea.sensing.camera import Pinhole
 from torchfovea.sensing.layout import LogPolar
 from torchfovea.setting import SettingError
@@ -196,6 +202,59 @@ def test_it_is_a_matcher(tmp_path):
     assert found.valid.sum() > 300
     for mine, other in zip(found, expected, strict=True):
         torch.testing.assert_close(mine, other)
+
+
+PRESETS = {
+    "onnx": (two_to_one, 1.0),
+    "onnx_s2m2": (s2m2, 1.0),
+    "onnx_foundation_stereo": (two_to_one, 1.0),
+    "onnx_raft_stereo": (raft, -1.0),
+    "onnx_igev": (lambda path: stacked(path, 0), 1.0),
+}
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_presets_fit_the_public_exports(tmp_path, preset):
+    make, sign = PRESETS[preset]
+    path = make(tmp_path / "model.onnx")
+    with initialize_config_dir(conf_dir(), version_base="1.3"):
+        cfg = compose("sense", [f"matcher={preset}", f"matcher.model={path}"])
+    matcher = build_match(cfg)
+    left, right = images()
+    answer = matcher.source(left, right)
+    told = isinstance(answer, tuple)
+    assert told == (preset == "onnx_s2m2") and matcher.params.scale == sign
+    disparity = (answer[0] if told else answer).numpy()
+    np.testing.assert_allclose(sign * disparity, 255 * (left - right)[..., 0], atol=1 if told else 2e-5)
+
+
+def test_a_confidence_that_is_turned_round_is_told(tmp_path, capsys, monkeypatch):
+    """Errors that grow with the confidence; the fit finds that what it claims is worth nothing."""
+    true = pytest.importorskip("skimage.data").stereo_motorcycle()[2]
+    rng = np.random.default_rng(0)
+    worth = rng.random(true.shape)
+    path = constant(
+        tmp_path / "m.onnx", np.where(np.isfinite(true), true, 0) + 2 * worth * rng.standard_normal(true.shape), worth
+    )
+    monkeypatch.chdir(tmp_path)
+    network = f"matcher.model={path}", "matcher.source.worth=worth", "matcher.nearest_range_m=1.5"
+    assert main(["calibrate", "matcher=onnx", *network, "scenes=0", "real=true", "sensor.receptive_fields=3000"]) == 0
+    said = capsys.readouterr()
+    assert "matcher.tells = confidence: errors shrink where it claims that they grow" in said.err
+    assert "matcher.tells=doubt turns it round" in said.err
+    result = json.loads((Path(said.out.splitlines()[-1]) / "result.json").read_text())
+    assert result["claim_rank_correlation"] < -0.2 and result["fit.claim"] < 0.3
+
+
+def test_a_missing_model_stops_a_command_in_one_line(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    for override, line in (
+        ("matcher.model=none.onnx", "matcher.model = none.onnx: expected an existing ONNX file"),
+        ("matcher.source.left=x", "matcher.model = None: expected an ONNX file: matcher.model=FILE"),
+    ):
+        assert main(["sense", "pair=motorcycle", "matcher=onnx", override]) == 1
+        assert capsys.readouterr().err.splitlines() == [f"torchfovea sense: {line}"]
 
 
 def test_a_model_that_does_not_fit_is_told_in_one_line(tmp_path):

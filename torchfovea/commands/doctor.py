@@ -34,6 +34,7 @@ OPTIONAL = {
     "hydra-ray-launcher": "sweeps with Ray: pip install 'torchfovea[ray]'",
     "cma": "tuning without gradients: pip install 'torchfovea[tune]'",
     "optuna": "tuning without gradients: pip install 'torchfovea[tune]'",
+    "onnxruntime": "matcher=onnx: pip install 'torchfovea[onnx]'",
 }
 
 # Each probe runs in a process of its own: a broken GL set-up can end the process that imports MuJoCo, and MUJOCO_GL is

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from torchfovea.sensing.correspondence import Budget, Correspondences, Disparity
 from torchfovea.sensing.layout import Retina
-from torchfovea.setting import require
-from torchfovea.stereo.external import External, match_external
+from torchfovea.setting import SettingError, require
+from torchfovea.stereo.external import DisparityFunction, External, match_external
 from torchfovea.stereo.matching import match_sgbm
 from torchfovea.stereo.sgbm import SGBM
 from torchfovea.stereo.sweep import Sweep, SweepRange, match_sweep
@@ -43,12 +43,13 @@ class Matcher(NamedTuple):
     Attributes:
         params: their type says which matcher it is.
         nearest_m: nearest range that is searched or believed [m].
-        source: of an external matcher: ``package.module:function``, or for a rectified pair a disparity file.
+        source: of an external matcher: a function of two images or its name ``package.module:function``, or for a
+            rectified pair a disparity file.
     """
 
     params: SGBM | Sweep | External
     nearest_m: float = 0.3
-    source: str | None = None
+    source: str | DisparityFunction | None = None
 
     def __call__(
         self, views: Views, retina: Retina | None, budget: Budget, /
@@ -64,8 +65,9 @@ class Matcher(NamedTuple):
         if isinstance(params, Sweep):
             return match_sweep(views, retina, params, budget, self.nearest_m)
         expected = "package.module:function, or a disparity file for a rectified pair"
-        require(self.source is not None, "matcher.source", None, expected)
-        return match_external(str(self.source), views, retina, params, budget, self.nearest_m)
+        if self.source is None:
+            raise SettingError(f"matcher.source = None: expected {expected}")
+        return match_external(self.source, views, retina, params, budget, self.nearest_m)
 
 
 def checked_matches(answer: object, retina: Retina) -> tuple[Correspondences, Any]:

@@ -13,14 +13,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from scipy.stats import spearmanr
 from torch import Tensor
 
 from torchfovea.sensing.correspondence import Budget
 from torchfovea.setting import require
 from torchfovea.studies.calibration import Judged, mixture_nll, select
 
-__all__ = ["BudgetFit", "Likelihood", "fit_budget", "least_match_px"]
+__all__ = ["BudgetFit", "Likelihood", "claim_rank", "fit_budget", "least_match_px"]
 
 # where the fit starts, and where what the data leave open stays
 SPREAD = {
@@ -69,6 +71,26 @@ class BudgetFit(NamedTuple):
 def least_match_px(step_px: float) -> float:
     """The matcher's error in each eye that a truth in steps [source px] cannot tell from none: step/√12 over both."""
     return step_px / math.sqrt(24)
+
+
+def claim_rank(sets: Sequence[Judged]) -> tuple[float, float]:
+    """Whether errors are large where the matcher claims that they are.
+
+    Args:
+        sets: observations; an error is counted in retinal pixels of the right eye.
+
+    Returns:
+        Spearman's rank correlation of the claimed standard deviation with the error's size, and the probability of one
+        as far from 0 by chance; NaN for claims that are all alike.
+    """
+    claim, error = (
+        torch.cat(parts).double().cpu().numpy()
+        for parts in zip(*((data.claim_px, (data.error / data.right_gain).abs()) for data in sets), strict=True)
+    )
+    if np.ptp(claim) == 0:
+        return math.nan, math.nan
+    found = spearmanr(claim, error)
+    return float(found.statistic), float(found.pvalue)
 
 
 def fit_budget(

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
 
 from torchfovea.commands.calibrate.report import bins, print_figures, regions_of, table
 from torchfovea.commands.calibrate.simulated import SceneTask, looks_at_scenes
@@ -23,9 +24,10 @@ from torchfovea.commands.shared.unread import refuse_unread
 from torchfovea.files import write_csv, write_result
 from torchfovea.sensing.correspondence import Budget
 from torchfovea.setting import require
+from torchfovea.stereo.external import External
 from torchfovea.stereo.matchers import Matcher
 from torchfovea.studies.calibration import Judged, concatenate, inlier_of, judge, select, sigma_of
-from torchfovea.studies.fitting import BudgetFit, Likelihood, fit_budget, least_match_px
+from torchfovea.studies.fitting import BudgetFit, Likelihood, claim_rank, fit_budget, least_match_px
 from torchfovea.studies.shared_errors import KnownLook, lasting_share_of, shared_share
 
 __all__ = ["run"]
@@ -33,6 +35,8 @@ __all__ = ["run"]
 QUICK = {"scenes": 2, "judged_scenes": 2, "looks": 2}
 FULL = {"scenes": 16, "judged_scenes": 16, "looks": 2}
 JUDGED_SEEDS = 1000  # scenes to judge on have seeds from here, so that none is fitted on
+CHANCE = 1e-3  # a rank correlation that chance makes less often is one
+TURNED = {"confidence": "doubt", "doubt": "confidence"}
 SHARPEST_PX = 0.01  # a fit whose median σ of a disparity is below this has collapsed
 
 
@@ -73,6 +77,7 @@ def run(cfg: DictConfig) -> float:
     if scenes:
         data["simulated"] = _simulate(cfg, start, scenes, judged_scenes, angles)
     data |= _pairs(cfg, start, matcher)
+    rank = _agreement(matcher, data)
 
     def fit(*without: str) -> BudgetFit:
         chosen = {name: split for name, split in data.items() if name not in without}
@@ -103,7 +108,7 @@ def run(cfg: DictConfig) -> float:
             figures[f"{prefix}hidden_valid{suffix}"] = _mean([look.hidden_valid_share[k] for look in split.looks])
     numbers = {name: value for name, value in asdict(after).items() if name != "source_px"}
     figures |= {f"fit.{name}": value for name, value in numbers.items()}
-    figures |= {"fit.loss": found.loss, "fit.first_loss": found.first_loss}
+    figures |= {"fit.loss": found.loss, "fit.first_loss": found.first_loss, "claim_rank_correlation": rank}
     write_csv(folder / "bins.csv", *bins({k: s.judged for k, s in data.items()}, models, *edges))
     write_csv(folder / "reliability.csv", *table({k: s.judged for k, s in data.items()}, models))
     from torchfovea.commands.calibrate.pictures import draw_calibration
@@ -151,6 +156,17 @@ def _pairs(cfg: DictConfig, budget: Budget, matcher: Matcher) -> dict[str, Split
             found["real"] = Split(right, right, [look], [], left_out=True)
             found["real_left"] = Split(left, left, [look], [], left_out=True)
     return found
+
+
+def _agreement(matcher: Matcher, data: dict[str, Split]) -> float:
+    """The rank correlation of what the matcher claims with its errors; one line on stderr where it is turned round."""
+    rank, chance = claim_rank([split.fitted for split in data.values()])
+    if isinstance(matcher.params, External) and rank < 0 and chance < CHANCE:
+        tells, other = matcher.params.tells, TURNED.get(matcher.params.tells)
+        turned = "" if other is None else f"; matcher.tells={other} turns it round"
+        line = f"matcher.tells = {tells}: errors shrink where it claims that they grow (rank correlation {rank:.2f})"
+        Console(stderr=True).print(f"{line}: expected the opposite{turned}", highlight=False, soft_wrap=True)
+    return rank
 
 
 def _sharing(budget: Budget, data: dict[str, Split]) -> Budget:

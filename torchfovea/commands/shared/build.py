@@ -52,7 +52,7 @@ __all__ = [
 # settings of the group sensor that are not the layout's own
 SENSOR = ("layout", "camera", "fov_deg", "sample", "source_px")
 # settings of the group matcher that are not a built-in matcher's own parameters
-MATCHER = ("name", "nearest_range_m", "source")
+MATCHER = ("name", "nearest_range_m", "source", "model")
 
 # A direction counts as reachable if its point at this range is: the neck turns about E, the eyes sit beside it.
 REACH_RANGE_M = 1.0
@@ -186,7 +186,11 @@ def build_match(cfg: DictConfig) -> Match:
     ours = isinstance(target, str) and target.startswith("torchfovea.")
     made = build_named(cfg, "matcher", form, MATCHER if ours else ("name",))
     if isinstance(made, SGBM | Sweep | External):
-        return Matcher(made, number(cfg, "matcher.nearest_range_m"), cfg.matcher.get("source"))
+        source = cfg.matcher.get("source")
+        if isinstance(source, DictConfig):
+            source = build_named(cfg, "matcher.source", "a function (left, right) that returns a disparity", ())
+            require(callable(source), "matcher.source", type(source).__name__, "a function (left, right)")
+        return Matcher(made, number(cfg, "matcher.nearest_range_m"), source)
     require(callable(made), "matcher", type(made).__name__, form)
     match: Match = made
     return match

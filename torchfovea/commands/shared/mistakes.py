@@ -46,6 +46,7 @@ EXTRAS = {
     "optuna": "tune",
     "gymnasium": "rl",
     "stable_baselines3": "ppo",
+    "onnxruntime": "onnx",
 }
 
 # settings that are gone, and what does their work
