@@ -9,7 +9,6 @@ from filterpy.kalman import KalmanFilter
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchfovea.arena import row, stack
 from torchfovea.gaussian import Gaussian, columns, inverse3, pack, positive_definite, unpack
 from torchfovea.memory.association import associate, in_front
 from torchfovea.memory.egosphere import (
@@ -26,6 +25,7 @@ from torchfovea.memory.nearest import build_index
 from torchfovea.memory.pooling import add_common, nearness, pool, pool_patches
 from torchfovea.memory.sphere import fibonacci_directions
 from torchfovea.memory.update import fuse, remember
+from torchfovea.rows import row, stack
 from torchfovea.sensing.chart import basis, cartesian_from_inverse_range
 from torchfovea.sensing.triangulation import Observations
 from torchfovea.setting import SettingError

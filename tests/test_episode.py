@@ -6,12 +6,13 @@ from functools import partial
 import pytest
 import torch
 
-from torchfovea.arena import Arenas, Fixation, Truth, stack
+from torchfovea.arena import Arenas, Fixation, Truth
 from torchfovea.deciding.strategies import expected_improvement, probability_of_improvement, upper_confidence_bound
 from torchfovea.episode import Rules, run_episode, run_episodes
 from torchfovea.memory.egosphere import Fusion, Prior
 from torchfovea.memory.sphere import fibonacci_directions
 from torchfovea.perception import Eligibility, Observer, decide, new_memory, perceive
+from torchfovea.rows import stack
 from torchfovea.search import Look, Move, search
 from torchfovea.sensing.camera import Pinhole
 from torchfovea.sensing.correspondence import Budget, Correspondences

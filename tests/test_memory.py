@@ -5,13 +5,13 @@ import dataclasses
 import pytest
 import torch
 
-from torchfovea.arena import row, stack
 from torchfovea.memory.egosphere import Fusion, Prior, empty_memory
 from torchfovea.memory.moving import motion, move, resample
 from torchfovea.memory.nearest import build_index, index_of_set, nearest_cell
 from torchfovea.memory.sphere import fibonacci_directions, latitude_longitude_directions
 from torchfovea.memory.update import remember
 from torchfovea.perception import Observer, decide, new_memory, perceive
+from torchfovea.rows import row, stack
 from torchfovea.sensing.correspondence import Budget, Correspondences
 from torchfovea.sensing.fields import draw_fields, for_all
 from torchfovea.sensing.geometric import correspond_points

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from torchfovea.cli import main
-from torchfovea.commands.shared.images import read_image, write_ply
+from torchfovea.cloud import write_ply
+from torchfovea.commands.shared.images import read_image
 from torchfovea.setting import SettingError
 from torchfovea.stereo.disparity_files import load_disparity
 

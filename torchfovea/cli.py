@@ -46,6 +46,12 @@ COMMANDS: dict[str, Command] = {
         "torchfovea sense pair=motorcycle",
         draws=True,
     ),
+    "replay": Command(
+        "torchfovea.commands.replay.command:run",
+        "a recording into the memory, the next fixation proposed at each frame",
+        "torchfovea replay recording=outputs/search/NAME/recording",
+        draws=True,
+    ),
     "characterize": Command(
         "torchfovea.commands.characterize.command:run",
         "what two eyes know of planes, foveal and uniform (Fig. 5), and how far to believe it",

@@ -13,11 +13,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchfovea.arena import Arena, Arenas, Fixation, Truth, row, stack
+from torchfovea.arena import Arena, Arenas, Fixation, Truth
 from torchfovea.deciding.strategies import Strategy, upper_confidence_bound
 from torchfovea.memory.egosphere import Memory
 from torchfovea.metrics import gap, global_information, local_information, near_target, regret, saccades_to_target
 from torchfovea.perception import Observer, Step
+from torchfovea.rows import row, stack
 from torchfovea.search import Look, Move, StopRule, search
 from torchfovea.sensing.head import Gaze, gaze_point
 from torchfovea.setting import require

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -16,12 +16,15 @@ from torch import Tensor
 from torchfovea.deciding.acquisition import Generators, known_well_enough
 from torchfovea.deciding.strategies import Strategy, upper_confidence_bound
 from torchfovea.memory.egosphere import Memory
+from torchfovea.memory.moving import Motion
+from torchfovea.memory.moving import move as move_memory
 from torchfovea.perception import Observer, Step, check_owner, decide, gaze_at, perceive
+from torchfovea.rows import row, stack
 from torchfovea.sensing.correspondence import Correspondences
-from torchfovea.sensing.head import Gaze, eyes, fixate
+from torchfovea.sensing.head import Eyes, Gaze, Head, eyes, fixate
 from torchfovea.setting import require
 
-__all__ = ["Glance", "Look", "Move", "Robot", "StopRule", "search"]
+__all__ = ["Glance", "Look", "Move", "Robot", "StopRule", "search", "seen_from"]
 
 StopRule = tuple[float, float]
 """(tolerance, probability) of `torchfovea.deciding.acquisition.known_well_enough`."""
@@ -34,11 +37,14 @@ class Move(NamedTuple):
         gaze: where the head settled, as its encoders tell.
         seconds: how long it took.
         degrees: travelled.
+        base: how the base moved since the look before, as odometry tells (`torchfovea.memory.moving.motion`; of B
+            robots with a leading axis); the memory goes along. None: it stood still.
     """
 
     gaze: Gaze
     seconds: float | Tensor
     degrees: float | Tensor
+    base: Motion | None = None
 
 
 class Look(NamedTuple):
@@ -47,10 +53,13 @@ class Look(NamedTuple):
     Attributes:
         matches: correspondences in both retinas, (..., N).
         pictures: whatever the sensor wants drawn (images, disparity), or nothing.
+        eyes: where the eyes were, in the ego frame of now, when the images were taken: for images that come late, see
+            `seen_from`. None: where the head rests.
     """
 
     matches: Correspondences
     pictures: Any = None
+    eyes: Eyes | None = None
 
 
 @runtime_checkable
@@ -61,8 +70,8 @@ class Robot(Protocol):
         """Turn the head to a gaze (...) and wait until it rests."""
         ...
 
-    def look(self, gaze: Gaze, generator: Any, /) -> Look:
-        """Sense at a gaze (...), where the head rests.
+    def look(self, gaze: Gaze, generator: Any, /) -> Look | None:
+        """Sense at a gaze (...), where the head rests; None where no images came: the memory stays as it is.
 
         Args:
             gaze: as the encoders told.
@@ -76,7 +85,8 @@ class Glance(NamedTuple):
 
     Attributes:
         move: the saccade; `move.gaze` is where the head is.
-        look: what was seen there; None: nobody looked any more, the stop rule ended the search before.
+        look: what was seen there; None: no images came, or nobody looked any more, for the stop rule had ended the
+            search.
         step: what is known then, and decided: `step.memory`, and `step.gaze`, where the head goes next.
         looked: bool (...), who looked.
         seconds: wall time of looking and deciding.
@@ -143,17 +153,48 @@ def _course(
             yield Glance(move, None, step, ~done, 0.0)
             return
         start = time.perf_counter()
-        look = robot.look(executed, generator)
-        require(isinstance(look, Look), "robot.look", type(look).__name__, "a torchfovea.search.Look")
-        matches = look.matches._replace(valid=look.matches.valid & ~done[..., None])
-        memory = perceive(observer, memory, matches, eyes(observer.head, executed))
+        if move.base is not None:
+            memory = _carried(observer, memory, move.base)
+        look, looked = robot.look(executed, generator), ~done
+        require(look is None or isinstance(look, Look), "robot.look", type(look).__name__, "a torchfovea.search.Look")
+        if look is None:
+            looked = torch.zeros_like(done)
+        else:
+            matches = look.matches._replace(valid=look.matches.valid & looked[..., None])
+            pose = eyes(observer.head, executed) if look.eyes is None else look.eyes
+            memory = perceive(observer, memory, matches, pose)
         step = decide(observer, memory, generator, executed, step, strategy)
-        seconds, looked = time.perf_counter() - start, ~done
+        seconds = time.perf_counter() - start
         if stop is not None:
             gaze, done = _stopped(observer, step, executed, done, stop)
             step = step._replace(gaze=gaze)
         gaze = step.gaze
         yield Glance(move, look, step, looked, seconds)
+
+
+def seen_from(head: Head, gaze: Gaze, base: Motion | None = None) -> Eyes:
+    """Where the eyes were when late images were taken, in the ego frame of now: the `eyes` of a `Look`.
+
+    Args:
+        head: of the observer.
+        gaze: of that moment (...).
+        base: how the base has moved since; its covariance is not used: odometry is far better known over a delay than
+            a match is. None: it stood still.
+    """
+    pose = eyes(head, gaze)
+    if base is None:
+        return pose
+    turn, shift = base.rotation.to(pose.t_left), base.translation.to(pose.t_left)
+    left, right = ((t - shift) @ turn for t in (pose.t_left, pose.t_right))
+    return Eyes(turn.mT @ pose.R_left, left, turn.mT @ pose.R_right, right)
+
+
+def _carried(observer: Observer, memory: Memory, base: Motion) -> Memory:
+    """One memory, or each of B, along with its base."""
+    if memory.cells.dim() == 2:
+        return move_memory(memory, base, observer.fusion)
+    rows = range(len(memory.cells))
+    return cast(Memory, stack([move_memory(row(memory, b), row(base, b), observer.fusion) for b in rows]))
 
 
 def _stopped(observer: Observer, step: Step, executed: Gaze, done: Tensor, stop: StopRule) -> tuple[Gaze, Tensor]:

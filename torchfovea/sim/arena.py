@@ -3,40 +3,29 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+import os
 
 import torch
 from torch import Tensor
 
 from torchfovea.arena import Fixation, Truth
+from torchfovea.looking import Pictures, look_at
 from torchfovea.perception import Observer
+from torchfovea.recordings.folder import Recorder
+from torchfovea.recordings.frames import Calibration
+from torchfovea.recordings.pictures import as_kept
 from torchfovea.search import Look, Move
-from torchfovea.sensing.correspondence import Disparity
 from torchfovea.sensing.fields import draw_fields, for_all
 from torchfovea.sensing.geometric import correspond_points, with_noise
 from torchfovea.sensing.head import Gaze, eyes
+from torchfovea.setting import require
 from torchfovea.sim.truth import truth_of
 from torchfovea.sim.world import World
-from torchfovea.stereo.matchers import Match, checked_matches
+from torchfovea.stereo.matchers import Match
 from torchfovea.stereo.rig import verged
-from torchfovea.stereo.sweep import SweepRange
 from torchfovea.stereo.views import verged_views
 
 __all__ = ["Pictures", "SimulatedArena"]
-
-
-class Pictures(NamedTuple):
-    """What a photometric look leaves to be drawn.
-
-    Attributes:
-        left: the left eye's image, (3, H, W) in [0, 1].
-        right: the right eye's.
-        found: what the matcher found, of the rectified view or along the left rays; of a user's own, anything.
-    """
-
-    left: Tensor
-    right: Tensor
-    found: Disparity | SweepRange | Any
 
 
 class SimulatedArena:
@@ -60,10 +49,25 @@ class SimulatedArena:
     ) -> None:
         self.world, self.observer, self.matcher, self.sample = world, observer, matcher, sample
         self.noise = torch.Generator().manual_seed(seed)
+        self.recorder: Recorder | None = None
+        self.seconds = 0.0
+
+    def record(self, folder: str | os.PathLike[str]) -> None:
+        """From now on keep what the eyes see, in a new recording; and the eyes see what it keeps.
+
+        Its clock is the motor's.
+
+        Raises:
+            SettingError: for the geometric sensor, which has no images, and a folder with a recording.
+        """
+        require(self.matcher is not None, "record", True, "images, fidelity=photometric")
+        camera, side = self.world.image_camera, self.world.source_px
+        self.recorder = Recorder(folder, Calibration(camera, camera, (side, side), self.observer.head, True))
 
     def saccade(self, gaze: Gaze) -> Move:
         """Move the head and wait until it rests; the gaze that comes back is what the encoders tell."""
         moved = self.world.saccade(gaze)
+        self.seconds += moved.seconds
         sigma = math.radians(self.observer.head.encoder_deg)
         error = sigma * torch.randn(3, generator=self.noise, dtype=torch.float64)
         return Move(Gaze(*(a + e for a, e in zip(moved.gaze, error, strict=True))), *moved[1:])
@@ -84,8 +88,11 @@ class SimulatedArena:
         observer = self.observer
         believed, gaze = gaze, self._true(gaze)
         if self.matcher is not None:
-            left, right = self.world.images(gaze)
-            return self.match(left.image, right.image, believed, generator)
+            left, right = (frame.image for frame in self.world.images(gaze))
+            if self.recorder is not None:
+                left, right = as_kept(left), as_kept(right)
+                self.recorder.write(self.seconds, left, right, believed)
+            return self.match(left, right, believed, generator)
         left_px = observer.retina.centers_px(dtype=gaze.pan.dtype)
         chosen = draw_fields(observer.retina.count, self.sample, generator)
         if chosen is not None:
@@ -104,11 +111,7 @@ class SimulatedArena:
         assert self.matcher is not None
         head, camera, retina = self.observer.head, self.observer.camera, self.observer.retina
         views = verged_views(left, right, verged(gaze.vergence, head.baseline_m), camera, retina.radius_px)
-        matches, found = checked_matches(self.matcher(views, retina, self.observer.budget), retina)
-        chosen = draw_fields(retina.count, self.sample, generator)
-        if chosen is not None:
-            matches = for_all(matches.take(chosen), retina)
-        return Look(matches, Pictures(left, right, found))
+        return look_at(self.observer, views, self.matcher, generator, self.sample)
 
     def truth(self, cells: Tensor) -> Truth:
         """What the judge knows: the nearest point, and the surface behind every memory cell (Nx, 3)."""

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchfovea.arena import stack
 from torchfovea.gaussian import columns
 from torchfovea.memory.egosphere import Memory
 from torchfovea.perception import Observer, new_memory
+from torchfovea.rows import stack
 from torchfovea.sensing.correspondence import Correspondences
 from torchfovea.sensing.fields import for_all
 from torchfovea.sensing.geometric import correspond_points, with_noise

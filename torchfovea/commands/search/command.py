@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import statistics
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -50,6 +51,8 @@ def run(cfg: DictConfig) -> float:
     device_of(cfg), sample_of(cfg), whole(cfg, "batch"), workers_of(cfg), number(cfg, "far_m")
     number(cfg, "near_target_m"), build_stop(cfg)
     require(isinstance(cfg.picture, bool), "picture", cfg.picture, "true or false")
+    require(isinstance(cfg.record, bool), "record", cfg.record, "true or false")
+    require(not (cfg.record and cfg.fidelity == "geometric"), "record", True, "images, fidelity=photometric")
     # mistakes come first, also in what is not used
     build_strategy(cfg, observer), build_match(cfg), build_motor(cfg), loaded_memory(cfg, observer)
     saved = memory_path(cfg, "memory.save")
@@ -65,7 +68,8 @@ def run(cfg: DictConfig) -> float:
         def advance(count: int) -> None:
             progress.update(task, advance=count)
 
-        for k, row, course, episode in _episodes(cfg, observer, [seed + k for k in range(episodes)], advance):
+        seeds = [seed + k for k in range(episodes)]
+        for k, row, course, episode in _episodes(cfg, observer, seeds, advance, _recordings(cfg, folder, episodes)):
             last = episode
             rows.append((k, seed + k, *row))
             steps.extend((k, *line) for line in course)
@@ -85,8 +89,21 @@ def run(cfg: DictConfig) -> float:
 Outcome = tuple[int, tuple[Any, ...], list[tuple[Any, ...]], Episode | None]
 
 
+def _recordings(cfg: DictConfig, folder: Path, episodes: int) -> list[str | None]:
+    """Where each episode is recorded: in recording, or recording/0, recording/1, ...; None: nowhere."""
+    if not cfg.record:
+        return [None] * episodes
+    whole_run = folder / "recording"
+    shutil.rmtree(whole_run, ignore_errors=True)  # of a run that was cut off here
+    return [str(whole_run)] if episodes == 1 else [str(whole_run / str(k)) for k in range(episodes)]
+
+
 def _episodes(
-    cfg: DictConfig, observer: Observer, seeds: list[int], advance: Callable[[int], None]
+    cfg: DictConfig,
+    observer: Observer,
+    seeds: list[int],
+    advance: Callable[[int], None],
+    recordings: list[str | None],
 ) -> Iterator[Outcome]:
     """Number, figures and course of every episode in order; the last one's episode itself besides."""
     (workers, backend), final = workers_of(cfg), len(seeds) - 1
@@ -100,12 +117,12 @@ def _episodes(
         return
     if workers == 1 or final == 0:
         for k, seed in enumerate(seeds):
-            episode = one_episode(cfg, observer, seed, _each(advance, 1))
+            episode = one_episode(cfg, observer, seed, _each(advance, 1), recordings[k])
             yield k, episode_row(episode), saccade_rows(episode), episode if k == final else None
         return
     settings = OmegaConf.to_yaml(OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"]), resolve=True)
     outcomes: dict[int, Outcome] = {}
-    work = [(settings, k, seed, k == final) for k, seed in enumerate(seeds)]
+    work = [(settings, k, seed, k == final, recordings[k]) for k, seed in enumerate(seeds)]
     for k, outcome in spread(_elsewhere, work, workers, backend):
         if isinstance(outcome, Exception):
             raise outcome
@@ -119,12 +136,12 @@ def _each(advance: Callable[[int], None], count: int) -> Callable[[int, Look, St
     return lambda t, look, step: advance(count)
 
 
-def _elsewhere(work: tuple[str, int, int, bool]) -> Outcome:
-    """An episode in a process of its own: its settings, number and seed, and whether it comes back whole."""
-    settings, k, seed, kept = work
+def _elsewhere(work: tuple[str, int, int, bool, str | None]) -> Outcome:
+    """An episode in a process of its own: its settings, number and seed, whether it comes back whole, its recording."""
+    settings, k, seed, kept, record = work
     cfg = OmegaConf.create(settings)
     assert isinstance(cfg, DictConfig)
-    episode = one_episode(cfg, build_observer(cfg), seed)
+    episode = one_episode(cfg, build_observer(cfg), seed, record=record)
     return k, episode_row(episode), saccade_rows(episode), episode if kept else None
 
 

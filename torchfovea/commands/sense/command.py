@@ -12,11 +12,11 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
+from torchfovea.cloud import write_ply
 from torchfovea.commands.sense.report import beside, match_figures, read_at_fields
 from torchfovea.commands.shared.budgets import build_budget
 from torchfovea.commands.shared.build import build_match, build_sensor, choice, name_of
 from torchfovea.commands.shared.config import run_folder
-from torchfovea.commands.shared.images import write_ply
 from torchfovea.commands.shared.pairs import gaze_of, load_pair
 from torchfovea.commands.shared.unread import refuse_unread
 from torchfovea.files import replacing, write_result
@@ -36,6 +36,8 @@ from torchfovea.stereo.views import Views
 from torchfovea.studies.calibration import mixture_std
 
 __all__ = ["Sensed", "run", "sense"]
+
+FRAME = "the left camera's frame: x right, y down, z forward"
 
 
 class Sensed(NamedTuple):
@@ -139,7 +141,7 @@ def _write(folder: Path, sensed: Sensed) -> None:
     mean, cov, colour = (t[keep].numpy() for t in (sensed.points.mean, sensed.points.cov, sensed.colour))
     inlier = sensed.observed.inlier
     inlier = torch.ones_like(sensed.observed.mean[:, 2]) if inlier is None else inlier
-    write_ply(folder / "points.ply", mean, cov, colour, inlier[keep].numpy())
+    write_ply(folder / "points.ply", mean, cov, colour, inlier[keep].numpy(), FRAME)
     with replacing(folder / "points.npz") as path:
         np.savez_compressed(
             path,

@@ -1,4 +1,4 @@
-"""Reading images that users have, and writing points for their viewers."""
+"""Reading images that users have."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfovea.files import replacing
 from torchfovea.setting import SettingError, require
 
-__all__ = ["read_image", "write_ply"]
+__all__ = ["read_image"]
 
 
 def _exists(path: Path, setting: str) -> None:
@@ -52,27 +51,3 @@ def _array(path: Path, setting: str) -> np.ndarray:
         return np.asarray(loaded if isinstance(loaded, np.ndarray) else loaded[loaded.files[0]])
     except (ValueError, IndexError, OSError) as error:
         raise SettingError(f"{setting} = {path}: expected a NumPy file with an array of numbers") from error
-
-
-def write_ply(path: Path, mean: np.ndarray, cov: np.ndarray, colour: np.ndarray, inlier: np.ndarray) -> None:
-    """Points as binary PLY, which every viewer opens; covariance and inlier probability travel as extra properties.
-
-    Args:
-        path: the file.
-        mean: (N, 3) [m].
-        cov: (N, 6), xx xy xz yy yz zz [m²].
-        colour: (N, 3) in [0, 1].
-        inlier: (N,) in [0, 1].
-    """
-    names = [*"xyz", *(f"cov_{c}" for c in ("xx", "xy", "xz", "yy", "yz", "zz")), "inlier"]
-    record = np.dtype([(name, "<f4") for name in names] + [(name, "u1") for name in ("red", "green", "blue")])
-    vertices = np.empty(len(mean), record)
-    for name, column in zip(names, np.concatenate([mean, cov, inlier[:, None]], -1).T, strict=True):
-        vertices[name] = column
-    for name, column in zip(("red", "green", "blue"), colour.T, strict=True):
-        vertices[name] = (column.clip(0, 1) * 255).round()
-    kinds = {"<f4": "float", "|u1": "uchar"}
-    properties = "".join(f"property {kinds[record[name].str]} {name}\n" for name in record.names or ())
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(mean)}\n{properties}end_header\n"
-    with replacing(path) as temporary:
-        temporary.write_bytes(header.encode() + vertices.tobytes())

@@ -10,7 +10,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from torchfovea.arena import Truth, stack
+from torchfovea.arena import Truth
 from torchfovea.commands.shared.build import build_arena, build_cells, build_motor, build_scene_of, name_of
 from torchfovea.commands.shared.memories import loaded_memory
 from torchfovea.commands.shared.settings import choice, number, whole
@@ -19,6 +19,7 @@ from torchfovea.deciding.strategies import Strategy
 from torchfovea.episode import Episode, Rules, run_episode, run_episodes
 from torchfovea.memory.egosphere import Memory
 from torchfovea.perception import Observer, Step, new_memory
+from torchfovea.rows import stack
 from torchfovea.search import Look
 from torchfovea.sensing.head import Head
 from torchfovea.setting import require
@@ -54,11 +55,17 @@ def sample_of(cfg: DictConfig) -> int | None:
 
 
 def one_episode(
-    cfg: DictConfig, observer: Observer, seed: int, each: Callable[[int, Look, Step], None] | None = None
+    cfg: DictConfig,
+    observer: Observer,
+    seed: int,
+    each: Callable[[int, Look, Step], None] | None = None,
+    record: str | None = None,
 ) -> Episode:
-    """The episode of one seed, with whatever sensor, renderer and motor."""
+    """The episode of one seed, with whatever sensor, renderer and motor; recorded in a folder if one is given."""
     generator = torch.Generator().manual_seed(seed)
     arena = build_arena(cfg, observer, seed)
+    if record is not None:
+        arena.record(record)
     memory = loaded_memory(cfg, observer)
     if memory is None:
         memory = new_memory(observer, build_cells(_aimed(cfg, arena.world.scene), observer.head, generator))

@@ -1,0 +1,1 @@
+"""`torchfovea replay`: a recording into the memory, frame by frame."""
