@@ -269,11 +269,11 @@ def test_a_robot_is_asked_for_what_it_promised():
         saccade = staticmethod(lambda gaze: gaze)
         look = arena.look
 
-    class Mute:
+    class Talker:
         saccade = arena.saccade
-        look = staticmethod(lambda gaze, generator: None)
+        look = staticmethod(lambda gaze, generator: "nothing")
 
-    for robot, message in ((Odd(), "robot.saccade = Gaze: expected"), (Mute(), "robot.look = NoneType: expected")):
+    for robot, message in ((Odd(), "robot.saccade = Gaze: expected"), (Talker(), "robot.look = str: expected")):
         with pytest.raises(SettingError, match=message):
             next(search(robot, observer, memory, 3))
     with pytest.raises(SettingError, match="saccades = 0"):
