@@ -10,12 +10,12 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
-from torchfovea.arena import row
 from torchfovea.envs.rows import SearchRows
 from torchfovea.envs.settings import EnvSettings
 from torchfovea.memory.egosphere import Memory, cartesian_belief, trust
 from torchfovea.metrics import information
 from torchfovea.perception import Observer
+from torchfovea.rows import row
 from torchfovea.search import Look
 from torchfovea.sensing.head import Gaze, Head, cyclopean, eyes
 from torchfovea.sensing.layout import LogPolar, cortical
