@@ -248,7 +248,7 @@ def write_pair(folder, **changes):
     cv2.imwrite(str(folder / "left.png"), texture[:, :50])
     cv2.imwrite(str(folder / "right.png"), texture[:, 10:])
     np.save(folder / "disparity.npy", np.full((40, 50), 10, np.float32))
-    lines = {"cam0": "[90 0 25; 0 91 20; 0 0 1]", "doffs": "3.5", "baseline": "120", "width": "50"} | changes
+    lines = {"cam0": "[90 0 25; 0 90 20; 0 0 1]", "doffs": "3.5", "baseline": "120", "width": "50"} | changes
     (folder / "calib.txt").write_text("".join(f"{k}={v}\n" for k, v in lines.items() if v is not None))
     return folder
 
@@ -265,9 +265,14 @@ def test_a_folder_is_a_pair(tmp_path):
     [
         (lambda f: (f / "calib.txt").unlink(), "calib.txt"),
         (lambda f: (f / "disparity.npy").unlink(), "disparity = 0: expected one file"),
-        (lambda f: write_pair(f, doffs="far"), "expected cam0, doffs and baseline as numbers"),
-        (lambda f: write_pair(f, baseline=None), "expected cam0, doffs and baseline as numbers"),
-        (lambda f: write_pair(f, baseline="-3"), "positive, finite numbers"),
+        (lambda f: write_pair(f, doffs="far"), r"pairs\[0\]: .*expected numbers of a calibration .*'far'"),
+        (lambda f: write_pair(f, baseline=None), r"calib.txt: expected baseline, which it lacks"),
+        (
+            lambda f: write_pair(f, baseline="-3"),
+            r"calib.txt: right camera .*\(-0.003, 0, 0\) m: expected it to the right",
+        ),
+        (lambda f: write_pair(f, cam0="[90 0 25; 0 91 20; 0 0 1]"), "raw cameras: expected those of a rectified pair"),
+        (lambda f: write_pair(f, height="41"), "size = 50x41: expected 50x40 px"),
         (lambda f: np.save(f / "disparity.npy", np.ones((3, 4), np.float32)), r"disparity = \(3, 4\)"),
     ],
 )

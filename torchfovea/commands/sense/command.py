@@ -1,4 +1,4 @@
-"""`torchfovea sense`: a rectified stereo pair to 3-D points with covariances, judged where the truth is known."""
+"""`torchfovea sense`: a calibrated stereo pair to 3-D points with covariances, judged where the truth is known."""
 
 from __future__ import annotations
 
@@ -64,6 +64,8 @@ def run(cfg: DictConfig) -> float | None:
     every = name_of(cfg, "sensor", "layout") == "every_pixel"
     retina = None if every else build_sensor(cfg)[1]  # the field of view is the images' own
     match, pair, folder = build_match(cfg), load_pair(cfg), run_folder()
+    raw = retina is None and pair.rig is not None
+    require(not raw, "sensor.layout", "every_pixel", "a retina (sensor=log_polar or uniform) for raw images")
     views, budget = pair.views(gaze_of(cfg, pair)), build_budget(cfg, pair=True)
     printed = choice(cfg, "budget.sigma_points", ("ours", "paper")) == "paper"
 
@@ -108,9 +110,10 @@ def _matched(match: Match, views: Views, retina: Retina | None, budget: Budget) 
 def sense(
     views: Views, retina: Retina | None, matches: Correspondences, points: SigmaPoints | None, rotated: bool
 ) -> Sensed:
-    """Correspondences of a rectified pair as points with covariances, in the left camera's frame."""
-    eye = torch.eye(3)
-    rig = Eyes(eye, torch.zeros(3), eye, torch.tensor([views.rig.baseline_m, 0.0, 0.0]))
+    """Correspondences of a pair as points with covariances, in the left camera's frame."""
+    rotation, across = views.rig.R_left.mT, views.rig.R_left.new_tensor([views.rig.baseline_m, 0.0, 0.0])
+    eye, right = torch.eye(3), ((rotation @ views.rig.R_right).float(), (rotation @ across).float())
+    rig = Eyes(eye, torch.zeros(3), *right)
     px, cameras = matches.left_px, views.cameras(retina)
     support = torch.full_like(px[..., 0], 0.5) if retina is None else retina.width_px(px) / 2
     observed = _doubted(observe(matches, rig, cameras, support, points, "inverse_range", rotated))

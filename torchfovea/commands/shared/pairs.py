@@ -1,8 +1,7 @@
-"""Rectified stereo pairs: a user's own files, a folder of a benchmark, and one that comes with a package."""
+"""Stereo pairs: a user's own files, a folder of a benchmark, and one that comes with a package."""
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,12 +10,15 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
+from torchfovea.commands.shared.cameras import cameras_of
 from torchfovea.commands.shared.images import read_image
-from torchfovea.commands.shared.settings import choice
-from torchfovea.sensing.camera import Pinhole
+from torchfovea.commands.shared.settings import choice, is_number
+from torchfovea.sensing.camera import Camera, Pinhole
 from torchfovea.setting import SettingError, require
+from torchfovea.stereo.calibration_files import StereoCalibration, load_calibration
 from torchfovea.stereo.disparity_files import load_disparity
-from torchfovea.stereo.views import Views, rectified_views
+from torchfovea.stereo.rig import StereoRig
+from torchfovea.stereo.views import Views, posed_views, rectified_views
 
 __all__ = ["Pair", "gaze_of", "load_folder", "load_pair", "motorcycle", "named_pair"]
 
@@ -24,7 +26,7 @@ SUFFIXES = (".npy", ".npz", ".pfm", ".png")
 
 
 class Pair(NamedTuple):
-    """A rectified stereo pair.
+    """A stereo pair, rectified or raw.
 
     Attributes:
         left: (3, H, W) in [0, 1].
@@ -32,22 +34,28 @@ class Pair(NamedTuple):
         camera_left: in image pixels.
         camera_right: in image pixels.
         baseline_m: between the cameras.
-        disparity: the truth, (H, W), not finite where unknown; or None.
+        disparity: the truth of a rectified pair, (H, W), not finite where unknown; or None.
+        rig: how cameras stand whose images are raw; None: the pair is rectified.
     """
 
     left: Tensor
     right: Tensor
-    camera_left: Pinhole
-    camera_right: Pinhole
+    camera_left: Camera
+    camera_right: Camera
     baseline_m: float
     disparity: Tensor | None
+    rig: StereoRig | None = None
 
     def views(self, gaze_px: tuple[float, float] | None) -> Views:
         """What a matcher is given of it, with retinas that look at a pixel (column, row), or at the middle."""
-        return rectified_views(*self[:5], gaze_px)
+        left, right = self.camera_left, self.camera_right
+        if self.rig is not None:
+            return posed_views(self.left, self.right, left, right, self.rig, gaze_px)
+        assert isinstance(left, Pinhole) and isinstance(right, Pinhole)
+        return rectified_views(self.left, self.right, left, right, self.baseline_m, gaze_px)
 
     def depth_m(self, disparity: Tensor) -> Tensor:
-        """Depth of disparities along the view's axis [m]."""
+        """Depth of a rectified pair's disparities along the view's axis [m]."""
         doffs = self.camera_right.cx_px - self.camera_left.cx_px
         return self.camera_left.focal_px * self.baseline_m / (disparity + doffs)
 
@@ -67,19 +75,12 @@ def load_pair(cfg: DictConfig) -> Pair:
     left, right = (read_image(_file(cfg, name), name) for name in ("left", "right"))
     _alike(left, right, "right")
     height, width = left.shape[-2:]
-    for name in ("focal_px", "cx_px", "cy_px", "baseline_m"):
-        if cfg[name] is None:
-            raise SettingError(
-                f"{name} = null: expected the calibration of the left camera, in image pixels and metres"
-            )
-    focal = _within(cfg, "focal_px", 1.0, 1e6, "a positive number of pixels, 1 to 1e6")
-    baseline = _within(cfg, "baseline_m", 1e-6, 1e4, "a positive number of metres, 1e-6 to 1e4")
-    reach = 100.0 * max(width, height)
-    near = f"a number of pixels within 100 images, {-reach:g} to {reach:g}"
-    cx, cy, doffs = (_within(cfg, name, -reach, reach, near) for name in ("cx_px", "cy_px", "doffs_px"))
+    cameras = cameras_of(cfg, (width, height))
+    raw = cfg.disparity is not None and not cameras.rectified
+    require(not raw, "disparity", cfg.disparity, "null for raw images: a disparity is that of a rectified pair")
     truth = None if cfg.disparity is None else load_disparity(_file(cfg, "disparity"), "disparity")[0]
     _fits(truth, left, "disparity")
-    return Pair(left, right, Pinhole(focal, cx, cy), Pinhole(focal, cx + doffs, cy), baseline, truth)
+    return _pair(left, right, cameras, truth)
 
 
 def named_pair(name: Any, where: str) -> Pair:
@@ -92,8 +93,8 @@ def load_folder(folder: Path, where: str) -> Pair:
     """A pair as Middlebury's benchmark has them, with its truth.
 
     Args:
-        folder: with left.png, right.png, disparity (.npy, .npz, .pfm or .png) and calib.txt: lines ``name=value`` with
-            cam0 as [f 0 cx; 0 f cy; 0 0 1], doffs [px] and baseline [mm].
+        folder: with left.png, right.png, disparity (.npy, .npz, .pfm or .png) and calib.txt, a calibration of a
+            rectified pair (`torchfovea.stereo.calibration_files`).
         where: the setting's name, for errors.
 
     Raises:
@@ -107,17 +108,12 @@ def load_folder(folder: Path, where: str) -> Pair:
     truth = load_disparity(found[0], f"{where}: disparity")[0]
     _fits(truth, left, f"{where}: disparity")
     calibration = folder / "calib.txt"
-    require(calibration.is_file(), f"{where}: calib.txt", calibration, "an existing file")
-    text = calibration.read_text(encoding="utf-8", errors="replace")
-    numbers = dict(line.split("=", 1) for line in text.splitlines() if "=" in line)
     try:
-        focal, _, cx, _, _, cy, *_ = (float(v) for v in numbers["cam0"].strip(" []").replace(";", " ").split())
-        doffs, baseline = float(numbers["doffs"]), float(numbers["baseline"]) / 1000
-    except (KeyError, ValueError) as error:
-        raise SettingError(f"{where}: {calibration}: expected cam0, doffs and baseline as numbers ({error})") from error
-    good = all(map(math.isfinite, (focal, cx, cy, doffs, baseline))) and min(focal, baseline) > 0
-    require(good, f"{where}: {calibration}", (focal, cx, cy, doffs, baseline), "positive, finite numbers")
-    return Pair(left, right, Pinhole(focal, cx, cy), Pinhole(focal, cx + doffs, cy), baseline, truth)
+        cameras = load_calibration([calibration], (left.shape[-1], left.shape[-2]))
+    except SettingError as error:
+        raise SettingError(f"{where}: {error}") from error
+    require(cameras.rectified, f"{where}: {calibration}", "raw cameras", "those of a rectified pair")
+    return _pair(left, right, cameras, truth)
 
 
 def motorcycle() -> Pair:
@@ -144,27 +140,21 @@ def gaze_of(cfg: DictConfig, pair: Pair) -> tuple[float, float] | None:
         return None
     height, width = pair.left.shape[-2:]
     expected = f"[column, row], a pixel of the {width}x{height} images"
-    two = OmegaConf.is_list(given) and len(given) == 2 and all(_number(v) for v in given)
+    two = OmegaConf.is_list(given) and len(given) == 2 and all(is_number(v) for v in given)
     require(two, "gaze_px", given, expected)
     column, row = (float(v) for v in given)
     require(0 <= column <= width - 1 and 0 <= row <= height - 1, "gaze_px", given, expected)
     return column, row
 
 
-def _number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _within(cfg: DictConfig, name: str, least: float, most: float, expected: str) -> float:
-    value = cfg[name]
-    require(_number(value), name, value, f"a number: {expected}")
-    require(least <= value <= most, name, value, expected)
-    return float(value)
-
-
 def _file(cfg: DictConfig, name: str) -> Path:
     require(isinstance(cfg[name], str), name, cfg[name], "a file's name")
     return Path(cfg[name])
+
+
+def _pair(left: Tensor, right: Tensor, cameras: StereoCalibration, truth: Tensor | None) -> Pair:
+    rig = None if cameras.rectified else cameras.rig
+    return Pair(left, right, cameras.left, cameras.right, cameras.rig.baseline_m, truth, rig)
 
 
 def _alike(left: Tensor, right: Tensor, where: str) -> None:

@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchfovea.setting import require
 
-__all__ = ["choice", "construct", "number", "typed", "whole"]
+__all__ = ["choice", "construct", "is_number", "number", "typed", "whole", "within"]
 
 T = TypeVar("T")
 
@@ -92,3 +92,16 @@ def number(cfg: DictConfig, setting: str) -> float:
     require(value > 0, setting, given, "a positive number")
     require(1e-9 <= value <= 1e9, setting, given, "a positive number, 1e-9 to 1e9")
     return value
+
+
+def within(cfg: DictConfig, setting: str, least: float, most: float, expected: str) -> float:
+    """A number from `least` to `most`, read at a name; `expected` says so."""
+    value = cfg[setting]
+    require(is_number(value), setting, value, f"a number: {expected}")
+    require(least <= value <= most, setting, value, expected)
+    return float(value)
+
+
+def is_number(value: Any) -> bool:
+    """Whether it is a finite number, and not a truth value."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
