@@ -1,4 +1,4 @@
-"""CONTRIBUTING.md's parts of a user's own, as they stand there: one file and one YAML each, outside of the package."""
+"""docs/own.md's parts of a user's own, as they stand there: one file and one YAML each, outside of the package."""
 
 import csv
 import json
@@ -14,7 +14,7 @@ from torchfovea.cli import main
 from torchfovea.sensing.own_layout import check_retina
 from torchfovea.sensing.retina import fovea, reconstruct
 
-PAGE = (Path(__file__).resolve().parents[1] / "CONTRIBUTING.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).resolve().parents[1] / "docs" / "own.md").read_text(encoding="utf-8")
 PARTS = {
     title: re.findall(r"```(\w*)\n(.*?)```", text, re.DOTALL)
     for title, text in re.findall(r"^### (.*?)\n(.*?)(?=^### |\Z)", PAGE, re.DOTALL | re.MULTILINE)
