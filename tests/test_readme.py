@@ -20,6 +20,7 @@ PAGES = {
 # language, what else stands behind it, the block
 BLOCK = re.compile(r"^( *)```(\w*)([^\n]*)\n(.*?)^\1```", re.DOTALL | re.MULTILINE)
 FILE = re.compile(r"# ([\w./-]+\.(?:py|yaml))$")
+MISTAKE = re.compile(r"torchfovea \w+: ")  # what a command says of a mistake
 OURS = ("torchfovea ", "bash scripts/run.sh")
 
 
@@ -53,7 +54,7 @@ def commands(page: str, others: list[tuple[str, str]]) -> list[str]:
     lines = [line for language, text in others if language in ("bash", "") for line in joined(text)]
     prose = BLOCK.sub("", PAGES[page])
     lines += [" ".join(code.split()) for code in re.findall(r"`([^`]+)`", prose) if "..." not in code]
-    return [line for line in lines if line.startswith(OURS)]
+    return [line for line in lines if line.startswith(OURS) and not MISTAKE.match(line)]
 
 
 def joined(text: str) -> list[str]:
