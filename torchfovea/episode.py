@@ -36,7 +36,7 @@ class Episode(NamedTuple):
         direction: unit direction in E of the true point at the fixation, (T, 3).
         range_m: true range at the fixation.
         aimed_m: range of the point that both eyes turned to.
-        reward: −range, floor or a miss −far_m.
+        reward: −range; floor, a miss or what is not of the class that is sought −far_m.
         gap: Eq. 46.
         regret: Eq. 50.
         global_information: Eq. 52 [nats].
@@ -183,8 +183,10 @@ def run_episodes(
         return torch.stack([torch.as_tensor(part).cpu() for part in parts], -1)
 
     ranges = over_time([f.range_m for f in fixations]).double()
-    reward = -torch.where(over_time([f.is_floor for f in fixations]), torch.inf, ranges).clamp(max=far_m)
     hit = over_time([f.is_target for f in fixations])
+    # where a class is sought, whatever is not of it is worth no more than the floor
+    nothing = over_time([f.is_floor for f in fixations]) if observer.classes is None else ~hit
+    reward = -torch.where(nothing, torch.inf, ranges).clamp(max=far_m)
     points = torch.stack([f.point.double().cpu() for f in fixations], 1)
     gazes = [over_time(angle).double() for angle in zip(*(move.gaze for move in moves), strict=True)]
     aimed = gaze_point(observer.head, Gaze(*gazes)).norm(dim=-1)

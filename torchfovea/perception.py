@@ -12,15 +12,18 @@ import torch
 from torch import Tensor
 
 from torchfovea.deciding.acquisition import Generators, choose
+from torchfovea.deciding.eligibility import Eligibility
 from torchfovea.deciding.reward import (
     RewardBelief,
     inverse_range_from_range,
+    of_class,
     range_from_inverse_range,
     range_reward,
     user_reward,
 )
 from torchfovea.deciding.strategies import Strategy, View, evaluate, upper_confidence_bound
 from torchfovea.gaussian import Gaussian, columns
+from torchfovea.memory.classes import Classes, class_moments, new_classes
 from torchfovea.memory.egosphere import (
     Fusion,
     Memory,
@@ -51,30 +54,6 @@ __all__ = ["Eligibility", "Observer", "Step", "check_owner", "decide", "gaze_at"
 
 
 @dataclass(frozen=True)
-class Eligibility:
-    """Which cells may be fixated.
-
-    Attributes:
-        nearest_m: points nearer than this are not looked at.
-        ground_z_m: a seen cell whose point lies lower than this above the floor is ground, and not an object.
-        ground_sigmas: by so many standard deviations of its height must a point lie above that. Of the hundreds of
-            cells on a floor that is seen out of the corner of an eye, noise lifts some well above it, and the nearest
-            of them would win every comparison: the floor is nearer than most objects.
-    """
-
-    nearest_m: float = 0.5
-    ground_z_m: float = 0.05
-    ground_sigmas: float = 2.0
-
-    def __post_init__(self) -> None:
-        """Raise SettingError for a negative distance, and numbers that are not finite."""
-        require(0 <= self.nearest_m < math.inf, "eligibility.nearest_m", self.nearest_m, "at least 0 metres")
-        require(math.isfinite(self.ground_z_m), "eligibility.ground_z_m", self.ground_z_m, "a finite height in metres")
-        sigmas = self.ground_sigmas
-        require(0 <= sigmas < math.inf, "eligibility.ground_sigmas", sigmas, "0 or more standard deviations")
-
-
-@dataclass(frozen=True)
 class Observer:
     """Everything about the observer that does not change while it looks around.
 
@@ -90,6 +69,8 @@ class Observer:
         reward: `inverse_range` or `range`: near is good, in either measure (Eq. 36); or any function of points
             (..., 3) in E that returns a number for each (`torchfovea.deciding.reward.user_reward`).
         eligibility: which cells may be fixated.
+        classes: what classes of things there are, and which one is sought: a cell's reward is then that of its surface
+            times its share of the class. None: whatever is near is good.
 
     How it chooses among them is no part of it: `decide` and `torchfovea.search.search` take a `strategy`.
     """
@@ -104,6 +85,7 @@ class Observer:
     prior: Prior = field(default_factory=Prior)
     reward: str | Callable[[Tensor], Tensor] = "inverse_range"
     eligibility: Eligibility = field(default_factory=Eligibility)
+    classes: Classes | None = None
     acquisition: InitVar[None] = None  # where strategies once were
 
     def __post_init__(self, acquisition: None) -> None:
@@ -112,6 +94,10 @@ class Observer:
         require(acquisition is None, "Observer(acquisition)", given, "decide(..., strategy=) or search(..., strategy=)")
         known = self.reward in ("inverse_range", "range") or callable(self.reward)
         require(known, "reward", self.reward, "inverse_range, range or a function of points (..., 3)")
+        near = self.classes is None or self.reward == "inverse_range"
+        require(
+            near, "reward", self.reward, "inverse_range for the nearest of a class, which is worth more than nothing"
+        )
 
 
 class Step(NamedTuple):
@@ -142,7 +128,8 @@ def new_memory(observer: Observer, cells: Tensor) -> Memory:
     Raises:
         SettingError: for no cells, or directions that are not unit vectors.
     """
-    return empty_memory(cells, observer.prior, observer.fusion.chart)
+    empty = empty_memory(cells, observer.prior, observer.fusion.chart)
+    return empty if observer.classes is None else empty._replace(classes=new_classes(observer.classes, cells))
 
 
 def check_owner(observer: Observer, memory: Memory) -> None:
@@ -153,6 +140,9 @@ def check_owner(observer: Observer, memory: Memory) -> None:
     """
     check_chart(memory, observer.fusion.chart, "fusion.chart")
     require(observer.prior == memory.prior, "prior", observer.prior, f"{memory.prior}, the prior of the memory")
+    known = 0 if memory.classes is None else memory.classes.shape[-1]
+    asked = 0 if observer.classes is None else observer.classes.count
+    require(asked in (0, known), "classes", asked, f"{known}, the classes of the memory")
 
 
 def perceive(
@@ -188,7 +178,7 @@ def perceive(
         # what looks at one place from one gaze share is all that its fields share
         same = torch.exp(-(((axis - memory.axis).norm(dim=-1, keepdim=True) / math.radians(SAME_GAZE_DEG)).square()))
         kin = kin._replace(lasting=kin.lasting + (kin.shared - kin.lasting).clamp(min=0) * same)
-    after = remember(memory, observed, observer.fusion, common, kin)
+    after = remember(memory, observed, observer.fusion, common, kin, matches.classes)
     if observer.fusion.votes:
         missed = within_sight(memory, after.looks == memory.looks, eyes, observer.camera, observer.retina)
         after = after._replace(votes=against(after.votes, missed))
@@ -236,7 +226,8 @@ def reward_of(observer: Observer, memory: Memory) -> tuple[Gaussian, RewardBelie
     deviation are averaged with the prior's by `torchfovea.memory.egosphere.trust`, so that no doubtful surface wins a
     comparison of thousands. Of the prior's standard deviation looks that should have shown something, and did not,
     leave less and less. Unseen cells that no look has reached share the prior's reward exactly: ties are ties. What no
-    look can change is not worth exploring, see `torchfovea.memory.egosphere.reducible`.
+    look can change is not worth exploring, see `torchfovea.memory.egosphere.reducible`. Where a class is sought, all is
+    worth that as far as it is of the class.
     """
     points, reward, unseen, variance = _rewards(observer, memory)
     sure, fruitless = trust(memory), memory.votes[..., 1]
@@ -247,7 +238,11 @@ def reward_of(observer: Observer, memory: Memory) -> tuple[Gaussian, RewardBelie
         torch.where(sure > 0, sure * known + (1 - sure) * std, std)
         for known in (reward.std, reward.std * reducible(memory, variance).sqrt())
     )
-    return points, RewardBelief(mean, whole), open_to_looks
+    if observer.classes is None or memory.classes is None:
+        return points, RewardBelief(mean, whole), open_to_looks
+    share = class_moments(memory.classes, observer.classes.sought)
+    worth = of_class(RewardBelief(mean, whole), *share)
+    return points, worth, of_class(RewardBelief(mean, open_to_looks), *share).std
 
 
 def _unseen_points(memory: Memory) -> Tensor:

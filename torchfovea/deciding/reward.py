@@ -24,6 +24,7 @@ __all__ = [
     "inverse_range_reward",
     "nearest_of_colour",
     "nearest_to",
+    "of_class",
     "range_from_inverse_range",
     "range_reward",
     "user_reward",
@@ -110,6 +111,22 @@ def inverse_range_from_range(belief: RewardBelief, near_m: float = 0.01) -> Rewa
     require(near_m > 0, "near_m", near_m, "a positive range in metres")
     inverse = 1 / (-belief.mean).clamp_min(near_m)
     return RewardBelief(inverse, belief.std * inverse * inverse)
+
+
+def of_class(belief: RewardBelief, share: Tensor, variance: Tensor) -> RewardBelief:
+    """The reward θ r of a surface whose reward is r and which is of the class that is sought with share θ.
+
+    Args:
+        belief: mean and std of r, (...).
+        share: mean of θ, 0 to 1, (...).
+        variance: of θ, which is independent of r, (...).
+
+    Returns:
+        Mean and std (...), exact: E[θr] = E[θ] E[r], E[(θr)²] = E[θ²] E[r²]. Differentiable.
+    """
+    mean = share * belief.mean
+    square = (share.square() + variance) * (belief.mean.square() + belief.std.square())
+    return RewardBelief(mean, _root(square - mean.square()))
 
 
 def user_reward(function: Callable[[Tensor], Tensor], gaussian: Gaussian, method: str = "first_order") -> RewardBelief:

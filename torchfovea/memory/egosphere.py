@@ -59,6 +59,7 @@ class Memory(NamedTuple):
         prior: what a cell believes before it is seen.
         chart: of the information, `inverse_range` or `cartesian`.
         axis: where the left eye looked last, unit (..., 3) in E; None: there was no look.
+        classes: what the cells show, (..., Nx, K), see `torchfovea.memory.classes`; None: nobody asks.
     """
 
     cells: Tensor
@@ -72,6 +73,7 @@ class Memory(NamedTuple):
     prior: Prior
     chart: str
     axis: Tensor | None = None
+    classes: Tensor | None = None
 
 
 @dataclass(frozen=True)

@@ -79,6 +79,10 @@ def motion(rotation: Tensor, translation: Tensor, covariance: Tensor | None = No
     return Motion(r, t, c)
 
 
+def _without_classes(memory: Memory) -> None:
+    require(memory.classes is None, "memory.classes", "a belief of classes", "none: it is neither moved nor resampled")
+
+
 def _frame(direction: Tensor) -> Tensor:
     """The cells' frames (..., 3, 3); rows are e₁, e₂ and the direction."""
     return torch.stack([*basis(direction), direction], -2)
@@ -174,6 +178,7 @@ def move(memory: Memory, step: Motion, fusion: Fusion) -> Memory:
     Raises:
         SettingError: for a batch of memories, or a fusion of another chart.
     """
+    _without_classes(memory)
     check_chart(memory, fusion.chart, "fusion.chart")
     require(memory.cells.dim() == 2, "cells", tuple(memory.cells.shape), "one memory, a shape (cells, 3)")
     cells, spacing_rad = memory.cells, memory.spacing_rad
@@ -266,6 +271,7 @@ def resample(memory: Memory, cells: Tensor, fusion: Fusion) -> Memory:
     Raises:
         SettingError: for a batch of memories, cells that are not unit directions or a fusion of another chart.
     """
+    _without_classes(memory)
     check_chart(memory, fusion.chart, "fusion.chart")
     require(memory.cells.dim() == 2, "cells", tuple(memory.cells.shape), "one memory, a shape (cells, 3)")
     chart, prior, spacing_rad = memory.chart, memory.prior, memory.spacing_rad

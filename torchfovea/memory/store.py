@@ -47,8 +47,10 @@ def save_memory(path: str | os.PathLike[str], memory: Memory) -> None:
     arrays: dict[str, Any] = {n: part.detach().cpu().numpy() for n, part in zip(_ENDS, parts, strict=True)}
     arrays["prior"] = np.array(astuple(memory.prior), dtype=np.float64)
     arrays["chart"] = np.array(memory.chart)
-    if memory.axis is not None:
-        arrays["axis"] = memory.axis.detach().cpu().numpy()
+    for name in ("axis", "classes"):
+        part = getattr(memory, name)
+        if part is not None:
+            arrays[name] = part.detach().cpu().numpy()
     with replacing(path) as temporary:
         np.savez_compressed(temporary, **arrays)
 
@@ -69,8 +71,8 @@ def load_memory(path: str | os.PathLike[str], setting: str = "path") -> Memory:
         parts = {name: torch.from_numpy(arrays[name]) for name in _ENDS}
         names = (field.name for field in fields(Prior))
         prior = Prior(**{name: float(number) for name, number in zip(names, arrays["prior"], strict=True)})
-        axis = torch.from_numpy(arrays["axis"]) if "axis" in arrays else None
-        _check(parts, axis)
+        axis, classes = (torch.from_numpy(arrays[n]) if n in arrays else None for n in ("axis", "classes"))
+        _check(parts, axis, classes)
         columnar = {name: columns(*parts[name].unbind(-1)) for name, end in _ENDS.items() if end}
         empty = empty_memory(columnar["cells"], prior, str(arrays["chart"]))
     except Exception as error:  # a damaged file fails in as many ways as there are layers below
@@ -82,15 +84,17 @@ def load_memory(path: str | os.PathLike[str], setting: str = "path") -> Memory:
         lasting=columnar["lasting"],
         votes=columnar["votes"],
         axis=axis,
+        classes=classes,
     )
 
 
-def _check(parts: dict[str, Tensor], axis: Tensor | None) -> None:
+def _check(parts: dict[str, Tensor], axis: Tensor | None, classes: Tensor | None) -> None:
     """Raise SettingError unless these can be a memory."""
     shape = parts["cells"].shape[:-1]
-    every = [*parts.values(), *([] if axis is None else [axis])]
+    every = [*parts.values(), *(part for part in (axis, classes) if part is not None)]
     good = all(parts[name].shape == (*shape, *end) for name, end in _ENDS.items())
     good = good and len(shape) > 0 and (axis is None or axis.shape == (*shape[:-1], 3))
+    good = good and (classes is None or (classes.shape[:-1] == shape and bool((classes > 0).all())))
     require(good, "shapes", [tuple(part.shape) for part in every], "those of one set of cells")
     kind = parts["cells"].dtype
     good = kind in (torch.float32, torch.float64) and all(part.dtype == kind for part in every)

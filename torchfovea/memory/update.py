@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchfovea.gaussian import Gaussian, Information, columns
 from torchfovea.memory.association import Pairs, associate, gather_columns
+from torchfovea.memory.classes import join_evidence
 from torchfovea.memory.egosphere import Fusion, Memory, Prior, blend, check_chart, forget
 from torchfovea.memory.pooling import Pooled, add_common, found_points, nearness, pool, pool_patches, share_errors
 from torchfovea.memory.voting import cast, see
@@ -53,6 +54,7 @@ def remember(
     fusion: Fusion,
     common: Common | None = None,
     kin: Kinship | None = None,
+    evidence: Tensor | None = None,
 ) -> Memory:
     """Enter one saccade's observations: associate (Eq. 22-23), vote, pool, add, fuse (Eq. 34-35).
 
@@ -62,6 +64,7 @@ def remember(
         fusion: how, in the memory's chart.
         common: see `add_common`; a function of the points that the saccade found, see `torchfovea.memory.encoders`.
         kin: what the observations' errors have in common; None: nothing. Patches only.
+        evidence: of each observation for every class, (..., N, K), where the memory asks for it.
 
     Returns:
         The memory after, in the dtype of the one before. Differentiable in the observations (the association and
@@ -78,6 +81,8 @@ def remember(
         memory = forget(memory, 0.5 ** (1 / fusion.half_life))
     gate_rad = math.radians(fusion.gate_deg)
     pairs = associate(cells, memory.lookup, memory.spacing_rad, observed, gate_rad, fusion.gate_spacing, fusion.fill)
+    if evidence is not None and memory.classes is not None:
+        memory = memory._replace(classes=join_evidence(memory.classes, evidence, pairs))
     if memory.chart == "cartesian":
         return _remember_points(memory, observed, pairs, fusion, common)
     return _remember_patches(memory, observed, pairs, fusion, common, kin)

@@ -40,6 +40,7 @@ class Correspondences(NamedTuple):
         support_px: (..., N), half the width that the left RF stands for [px]: its own, and more where only some of the
             RFs were looked through; None: its own, by the retina.
         lasting: (..., N), share of the variance that another look at the same surface repeats; None: the budget's.
+        classes: (..., N, K), how likely what the RF shows is for each class of things; None: it tells nothing of that.
     """
 
     left_px: Tensor
@@ -50,6 +51,7 @@ class Correspondences(NamedTuple):
     inlier: Tensor | None = None
     support_px: Tensor | None = None
     lasting: Tensor | None = None
+    classes: Tensor | None = None
 
     def take(self, index: int | Tensor) -> Correspondences:
         """Every part at an index of the first axis: some receptive fields (N,), or one row of a batch (B, N)."""

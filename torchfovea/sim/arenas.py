@@ -11,11 +11,13 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchfovea.arena import Fixation
+from torchfovea.memory.classes import Classes
 from torchfovea.perception import Observer
 from torchfovea.search import Look, Move
 from torchfovea.sensing.fields import draw_fields, for_all
 from torchfovea.sensing.geometric import correspond_points, with_noise
 from torchfovea.sensing.head import Gaze, clamp_gaze, cyclopean, eyes, to_ego
+from torchfovea.sensing.marks import field_width_rad, read_marks, readable
 from torchfovea.setting import require
 from torchfovea.sim.model import Scene
 from torchfovea.sim.motor import InstantMotor, Motor
@@ -69,9 +71,12 @@ class GeometricArenas:
             most = max(len(scene.kind) for scene in self.pool)
             self._solids = solids_of(self.pool, self.device)
             self._kind = torch.stack([pad(scene.kind, (0, most - len(scene.kind)), value=-1) for scene in self.pool])
+            if self.observer.classes is not None:
+                self._mark, self.detail_m = _marks(self.pool, self.observer.classes, most)
         self.stands[list(rows)] = torch.tensor([places[id(scene)] for scene in scenes])
         self.solids = take(self._solids, self.stands.to(self.device))
         self.kind = self._kind[self.stands].to(self.device)
+        self.mark = None if self.observer.classes is None else self._mark[self.stands].to(self.device)
 
     def renew(self, rows: Sequence[int], scenes: Sequence[Scene], seeds: Sequence[int]) -> None:
         """Put rows into other scenes, their heads straight ahead.
@@ -92,6 +97,7 @@ class GeometricArenas:
         part.solids, part.kind = take(self.solids, index.to(self.device)), self.kind[index.to(self.device)]
         part.stands, part.noise, part._whole = self.stands[index], [self.noise[row] for row in rows], (self, index)
         part.before = self.before[index]
+        part.mark = None if self.mark is None else self.mark[index.to(self.device)]
         return part
 
     def saccade(self, gaze: Gaze) -> Move:
@@ -137,19 +143,49 @@ class GeometricArenas:
         some = any(index is not None for index in chosen)
         if some:
             left_px = left_px[torch.stack([index for index in chosen if index is not None]).to(device)]
-        points, visible = self._surfaces(gaze, observer.camera.rays(left_px))
+        points, visible, geom = self._surfaces(gaze, observer.camera.rays(left_px))
         matches = correspond_points(points, visible, left_px, pose, observer.camera, observer.retina, observer.budget)
         matches = with_noise(matches, observer.retina, generators)
+        if self.mark is not None and observer.classes is not None:
+            away = (points - pose.t_left[:, None]).norm(dim=-1)
+            width = field_width_rad(observer.camera, observer.retina, observer.budget, left_px) * away
+            mark, share = self.mark.gather(1, geom), readable(width, self.detail_m)
+            matches = matches._replace(classes=read_marks(mark, share, observer.classes.count, generators))
         return Look(for_all(matches, observer.retina) if some else matches)
 
-    def _surfaces(self, gaze: Gaze, left_rays: Tensor) -> tuple[Tensor, Tensor]:
-        """What each left ray meets, and whether the right eye sees it; see `torchfovea.sim.world.World.correspond`."""
+    def _surfaces(self, gaze: Gaze, left_rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """What each left ray meets, and whether the right eye sees it; see `torchfovea.sim.world.World.correspond`.
+
+        And its geom, of which nothing comes where nobody asks for marks.
+        """
         pose = eyes(self.observer.head, Gaze(*(angle.detach().double() for angle in gaze)))
         x, y, z = left_rays.double().unbind(-1)
         scale = torch.rsqrt(x * x + y * y + z * z)
         unit = torch.stack([x * scale, y * scale, z * scale]).movedim(0, -1)
         direction = to_ego(pose.R_left, unit.expand(len(self.kind), -1, -1))
-        points = pose.t_left[:, None] + ranges(self.solids, pose.t_left, direction)[..., None] * direction
+        if self.mark is None:
+            range_m = ranges(self.solids, pose.t_left, direction)
+            geom = torch.empty(0, dtype=torch.int64)
+        else:
+            range_m, geom = trace(self.solids, pose.t_left, direction)
+        points = pose.t_left[:, None] + range_m[..., None] * direction
         line = points - pose.t_right[:, None]
         ahead = (line * pose.R_right[:, None, :, 2]).sum(-1) > 0
-        return points.to(left_rays.dtype), ahead & ~occluded(self.solids, pose.t_right, points)
+        return points.to(left_rays.dtype), ahead & ~occluded(self.solids, pose.t_right, points), geom
+
+
+def _marks(scenes: Sequence[Scene], classes: Classes, most: int) -> tuple[Tensor, float]:
+    """The class of every geom, (B, G), and the detail that tells them; scenes without such marks are refused."""
+    rows, detail_m = [], 0.0
+    for scene in scenes:
+        told = scene.marks
+        require(told is not None, "reward", "of_class", "a scene whose things bear marks, such as scene=marked")
+        assert told is not None
+        known = f"{told.classes}, the classes of the scene"
+        require(classes.count == told.classes, "reward.count", classes.count, known)
+        here = f"{told.sought}, the class of the scene's target"
+        require(classes.sought == told.sought, "reward.sought", classes.sought, here)
+        require(detail_m in (0.0, told.detail_m), "scene.detail_m", told.detail_m, f"{detail_m}, as in the others")
+        rows.append(pad(told.of_geom, (0, most - len(told.of_geom))))
+        detail_m = told.detail_m
+    return torch.stack(rows), detail_m

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from torchfovea.sensing.head import Gaze, Head, cyclopean, eyes, fixate
 from torchfovea.setting import SettingError, require
@@ -17,7 +18,7 @@ from torchfovea.sim.rays import cast
 from torchfovea.sim.room import POLE, TARGET, Room, Solid, can, furnish, pole
 from torchfovea.sim.truth import reachable_grid
 
-__all__ = ["Cans", "place_cans", "target_in_sight"]
+__all__ = ["Cans", "place_cans", "point_in_sight", "target_in_sight"]
 
 _BATCH = 256  # candidates drawn at once
 _GROUNDED_M = 0.05  # a can this near the floor stands on it
@@ -248,10 +249,27 @@ def place_cans(params: Cans, head: Head, rng: np.random.Generator, around: list[
 
 
 def target_in_sight(scene: Scene, margin_m: float) -> bool:
-    """Whether rays confirm a target.
+    """Whether rays confirm a target: see `point_in_sight`, and everything else that the head can reach is farther.
 
-    E sees nearly all of its front, both eyes and C see its nearest point when they fixate it, and everything else that
-    the head can reach is farther by the margin (its own pole by a fifth of it).
+    By the margin; its own pole by a fifth of it.
+    """
+    near = point_in_sight(scene)
+    if near is None:
+        return False
+    geom = next(iter(scene.target_geoms))
+    direction = reachable_grid(scene.head, 0.5)
+    hits = cast(scene, torch.zeros(3, dtype=torch.float64), direction)
+    within = fixate(scene.head, hits.range_m[:, None] * direction)[1] & ~scene.is_floor(hits.geom) & (hits.geom != geom)
+    limit = torch.full_like(hits.range_m, float(near.norm()) + margin_m)
+    own = scene.is_kind(hits.geom, POLE) & (scene.kind[(hits.geom - 1).clamp(min=0)] == TARGET)
+    limit = torch.where(own, limit - 0.8 * margin_m, limit)
+    return bool((hits.range_m[within] >= limit[within]).all())
+
+
+def point_in_sight(scene: Scene) -> Tensor | None:
+    """The nearest point (3,) of the target, a can, if it can be seen; None otherwise.
+
+    E sees nearly all of its front, and both eyes and C see its nearest point when they fixate it.
     """
     geom = next(iter(scene.target_geoms))
     radius, half = scene.model.geom_size[geom][:2]
@@ -274,17 +292,11 @@ def target_in_sight(scene: Scene, margin_m: float) -> bool:
         -1,
     ).reshape(-1, 3)
     if float((cast(scene, origin, outline).geom == geom).double().mean()) < 0.95:
-        return False
+        return None
     gaze, reachable = fixate(scene.head, near)
     inner = near + 1e-3 * torch.nn.functional.normalize(torch.tensor([x, y, z], dtype=torch.float64) - near, dim=0)
     pose = eyes(scene.head, gaze)
     for eye in (pose.t_left, pose.t_right, cyclopean(scene.head, gaze)[1]):
         if int(cast(scene, eye, (inner - eye)[None]).geom[0]) != geom:
-            return False
-    direction = reachable_grid(scene.head, 0.5)
-    hits = cast(scene, origin, direction)
-    within = fixate(scene.head, hits.range_m[:, None] * direction)[1] & ~scene.is_floor(hits.geom) & (hits.geom != geom)
-    limit = torch.full_like(hits.range_m, float(near.norm()) + margin_m)
-    own = scene.is_kind(hits.geom, POLE) & (scene.kind[(hits.geom - 1).clamp(min=0)] == TARGET)
-    limit = torch.where(own, limit - 0.8 * margin_m, limit)
-    return bool(reachable) and bool((hits.range_m[within] >= limit[within]).all())
+            return None
+    return near if bool(reachable) else None

@@ -14,7 +14,7 @@ from torchfovea.sensing.head import Head
 from torchfovea.sim.room import FLOOR, TARGET, Solid
 from torchfovea.sim.texture import Paint
 
-__all__ = ["EgoPose", "Nearest", "Scene"]
+__all__ = ["EgoPose", "Marks", "Nearest", "Scene"]
 
 
 class EgoPose(NamedTuple):
@@ -43,6 +43,22 @@ _ORIGIN = EgoPose()
 _NOTHING = Nearest(torch.zeros(3, dtype=torch.float64), math.inf, -1)
 
 
+class Marks(NamedTuple):
+    """What tells the things of a scene apart.
+
+    Attributes:
+        of_geom: the class of each geom, int64 (G,), 0 for what bears no mark.
+        classes: how many there are, K.
+        sought: the class of the target.
+        detail_m: size of what tells the marks apart.
+    """
+
+    of_geom: Tensor
+    classes: int
+    sought: int
+    detail_m: float
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """A compiled scene seen from one place.
@@ -58,6 +74,7 @@ class Scene:
         nearest: the truth, from `torchfovea.sim.truth`.
         params: the settings it was built from.
         seed: and the seed.
+        marks: what tells its things apart; the truth then is about the target alone. None: nearness does.
     """
 
     model: Any
@@ -70,6 +87,7 @@ class Scene:
     nearest: Nearest = _NOTHING
     params: object = None
     seed: int = 0
+    marks: Marks | None = None
 
     @property
     def world_from_ego(self) -> tuple[np.ndarray, np.ndarray]:

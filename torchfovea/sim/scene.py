@@ -11,6 +11,7 @@ from torchfovea.sensing.head import Head
 from torchfovea.setting import require
 from torchfovea.sim.cans import Cans
 from torchfovea.sim.compile import scene_of, seeded, stand_at
+from torchfovea.sim.marked import Marked
 from torchfovea.sim.model import EgoPose, Nearest, Scene
 from torchfovea.sim.room import Room, Solid, can, furnish
 
@@ -18,6 +19,7 @@ __all__ = [
     "AttentionWorld",
     "Cans",
     "EgoPose",
+    "Marked",
     "Nearest",
     "Room",
     "Scene",

@@ -47,12 +47,15 @@ def reachable_grid(head: Head, step_deg: float) -> Tensor:
 def _eligible_range(scene: Scene, direction: Tensor) -> tuple[Tensor, RayHits]:
     hits = cast(scene, torch.zeros(3, dtype=torch.float64), direction)
     _, reachable = fixate(scene.head, hits.range_m[:, None] * direction)
-    keep = reachable & (hits.geom >= 0) & ~scene.is_floor(hits.geom)
+    sought = ~scene.is_floor(hits.geom) if scene.marks is None else scene.is_target(hits.geom)
+    keep = reachable & (hits.geom >= 0) & sought
     return torch.where(keep, hits.range_m, torch.full_like(hits.range_m, math.inf)), hits
 
 
 def find_nearest(scene: Scene, step_deg: float = 0.3) -> Nearest:
     """The nearest reachable surface point that is not floor, among first surfaces on rays from E's origin.
+
+    In a scene with marks, that of the target.
 
     A grid over all reachable directions, then shrinking grids around the best places of it, to well below a millimetre.
     An object thinner than `step_deg` may be missed.

@@ -47,6 +47,8 @@ def run(cfg: DictConfig) -> float:
     episodes, saccades, seed = whole(cfg, "episodes"), whole(cfg, "saccades"), whole(cfg, "seed", 0)
     observer, folder = build_observer(cfg), run_folder()
     choice(cfg, "fidelity", ("photometric", "geometric"))
+    reads = observer.classes is None or batched(cfg)
+    require(reads, "reward", "of_class", "fidelity=geometric motor=instant, whose receptive fields read marks")
     build_renderer(cfg) if cfg.fidelity == "photometric" else name_of(cfg, "renderer")
     device_of(cfg), sample_of(cfg), whole(cfg, "batch"), workers_of(cfg), number(cfg, "far_m")
     number(cfg, "near_target_m"), build_stop(cfg)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchfovea.commands.shared.budgets import build_budget
 from torchfovea.commands.shared.named import build_named, name_of, targets_of
-from torchfovea.commands.shared.rewards import build_reward
+from torchfovea.commands.shared.rewards import build_classes, build_reward
 from torchfovea.commands.shared.settings import choice, construct, number, typed, whole
 from torchfovea.memory import sphere
 from torchfovea.memory.egosphere import Fusion, Prior
@@ -93,6 +93,7 @@ def build_observer(cfg: DictConfig) -> Observer:
         prior=construct(Prior, cfg.prior, "prior"),
         reward=build_reward(cfg),
         eligibility=construct(Eligibility, cfg.eligibility, "eligibility"),
+        classes=build_classes(cfg),
     )
 
 
@@ -163,6 +164,7 @@ def build_motor(cfg: DictConfig) -> Callable[[Scene], Motor]:
 
 def build_arena(cfg: DictConfig, observer: Observer, seed: int) -> SimulatedArena:
     """The simulated world of an episode."""
+    require(observer.classes is None, "reward", "of_class", "fidelity=geometric motor=instant in search, to read marks")
     scene = build_scene_of(cfg, observer.head, seed)
     fidelity = choice(cfg, "fidelity", ("photometric", "geometric"))
     world = World(

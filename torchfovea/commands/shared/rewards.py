@@ -11,10 +11,12 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from torchfovea.commands.shared.named import build_named, name_of
+from torchfovea.commands.shared.settings import construct
 from torchfovea.deciding import reward
+from torchfovea.memory.classes import Classes
 from torchfovea.setting import require
 
-__all__ = ["build_reward", "nearest_to"]
+__all__ = ["build_classes", "build_reward", "nearest_to"]
 
 FORM = "a function of points (..., 3) [m] that returns a reward (...) for each"
 
@@ -46,6 +48,20 @@ def build_reward(cfg: DictConfig) -> Any:
     name = name_of(cfg, "reward")
     if name in ("inverse_range", "range"):
         return name
+    if name == "of_class":
+        return "inverse_range"
     made: Callable[[Tensor], Tensor] = build_named(cfg, "reward", FORM)
     require(callable(made), "reward", type(made).__name__, FORM)
     return made
+
+
+def build_classes(cfg: DictConfig) -> Classes | None:
+    """What `reward=of_class` seeks; None for any other reward.
+
+    Raises:
+        SettingError: for classes that are none.
+    """
+    if name_of(cfg, "reward") != "of_class":
+        return None
+    settings = {str(key): value for key, value in cfg.reward.items() if key not in ("name", "_target_")}
+    return construct(Classes, settings, "reward")

@@ -1,0 +1,66 @@
+"""Cans of one shape, of which the one sought bears a mark: only fine receptive fields tell it from nearer ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import torch
+
+from torchfovea.sensing.head import Head
+from torchfovea.setting import SettingError, require
+from torchfovea.sim.cans import Cans, place_cans, point_in_sight
+from torchfovea.sim.compile import compile_solids, seeded, stand_at
+from torchfovea.sim.model import EgoPose, Marks, Scene
+from torchfovea.sim.room import CAN, TARGET, furnish
+
+__all__ = ["Marked"]
+
+
+@dataclass(frozen=True)
+class Marked:
+    """Cans with marks, one of which bears the one that is sought; it is not the nearest.
+
+    Attributes:
+        cans: where they stand.
+        marks: how many different ones there are, classes 1, 2, ...; all but the target bear another than it does.
+        sought: the target's.
+        detail_m: size of what tells the marks apart.
+    """
+
+    cans: Cans = field(default_factory=Cans)
+    marks: int = 3
+    sought: int = 1
+    detail_m: float = 0.004
+
+    def __post_init__(self) -> None:
+        """Raise SettingError for marks that tell nothing apart."""
+        require(isinstance(self.marks, int) and 2 <= self.marks <= 63, "scene.marks", self.marks, "2 to 63 marks")
+        borne = isinstance(self.sought, int) and 1 <= self.sought <= self.marks
+        require(borne, "scene.sought", self.sought, f"a class that an object has, 1 to {self.marks}")
+        require(1e-5 <= self.detail_m <= 1, "scene.detail_m", self.detail_m, "0.00001 to 1 metre")
+
+    def __call__(self, seed: int, head: Head) -> Scene:
+        """The scene; see `torchfovea.sim.scene.SceneRecipe`.
+
+        Raises:
+            SettingError: a region that admits no scene.
+        """
+        rng = seeded(seed)
+        others = [mark for mark in range(1, self.marks + 1) if mark != self.sought]
+        for _ in range(self.cans.tries):
+            room = furnish(self.cans.room, rng)
+            solids = place_cans(self.cans, head, rng, room)
+            chosen = f"can_{rng.integers(1, self.cans.cans)}"
+            kinds = {TARGET: CAN, CAN: CAN}
+            solids = [replace(s, kind=TARGET if s.name == chosen else kinds.get(s.kind, s.kind)) for s in room + solids]
+            marks = [
+                self.sought if s.kind == TARGET else int(rng.choice(others)) if s.kind == CAN else 0 for s in solids
+            ]
+            scene = compile_solids(solids, head, rng, self, seed)
+            if point_in_sight(scene) is not None:
+                told = Marks(torch.tensor(marks), self.marks + 1, self.sought, self.detail_m)
+                return stand_at(replace(scene, marks=told), EgoPose())
+        place = self.cans.azimuth_deg
+        raise SettingError(
+            f"scene.cans.azimuth_deg = {place}: expected a region in which a can is seen behind no other"
+        )
