@@ -34,7 +34,7 @@ def test_a_users_own(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["reward.name=near"], "reward.name = near: expected one of external, inverse_range, nearest_to, of_class, range"),
+        (["reward.name=near"], "reward.name = near: expected one of external, inverse_range, nearest_to, of"),
         (["reward=nearest_to"], "reward.point = None"),
         (["reward=nearest_to", "reward.point=[1,2]"], r"reward.point = \[1, 2\]"),
         (["reward=nearest_to", "reward.point=[1,2,nan]"], r"reward.point = \[1, 2, nan\]"),
