@@ -10,7 +10,7 @@ import pytest
 
 from torchfovea.cli import main
 from torchfovea.cloud import write_ply
-from torchfovea.commands.shared.images import read_image
+from torchfovea.commands.shared.images import exposed, read_picture
 from torchfovea.setting import SettingError
 from torchfovea.stereo.disparity_files import load_disparity
 
@@ -65,20 +65,30 @@ def test_the_motorcycle(folder, capsys):
     points = points_of(run)
     assert len(points["mean_m"]) == result["points"] and np.isfinite(points["cov_m2"]).all()
     assert 1.5 < np.median(points["mean_m"][:, 2]) < 5
+    assert "the left camera's frame: x right" in str(points["frame"]) and "cov_m2 m^2" in str(points["units"])
+    assert str(points["cov_order"]).startswith("xx xy xz yy yz zz")
+    assert b"comment metres, the left camera's frame" in (run / "points.ply").read_bytes()[:300]
     assert len(points["inlier"]) == result["points"] and ((points["inlier"] > 0) & (points["inlier"] <= 1)).all()
     # no two points look at one source pixel
-    pixel = np.round(points["left_px"] * 500 / 200)
+    pixel = np.round(points["left_image_px"] - np.array([370, 249.5]))
     assert len(np.unique(pixel, axis=0)) == len(pixel)
+    assert result["image_seen"] == 1 and np.ptp(pixel[:, 0]) > 700 and np.ptp(pixel[:, 1]) > 480
+    assert result["rows_px"] < 0.15 and not result["warnings"]
     assert result["valid_fraction"] != result["valid_fraction_by_area"] and 0 < result["hidden_valid_by_area"] < 1
     assert result["coverage_95_by_area"] < result["coverage_95"] and math.isfinite(result["nll_by_area"])
 
 
 def test_points_survive_a_judgement_that_fails(folder, capsys, plane):
-    """A truth of another sign: nothing lies within 5 standard deviations, and the points are there."""
+    """A truth in other units: nothing is judged by it, or nothing is right, and the points are there."""
     np.save("wrong.npy", np.full(SIZE, 150, np.float32))
-    run, result = sense(capsys, *plane, "disparity=wrong.npy", "sensor.receptive_fields=4000", "matcher=sgbm")
+    overrides = [*plane, "disparity=wrong.npy", "sensor.receptive_fields=2000"]
+    run, result = sense(capsys, *overrides)
+    assert len(points_of(run)["mean_m"]) == result["points"] > 500 and "median_error_m" not in result
+    (warning,) = result["warnings"]
+    assert "disparity: 12.5 times what" in warning and "units of 1/12.5 px" in warning and "not judged" in warning
+    run, result = sense(capsys, *overrides, "health=warn")
     assert len(points_of(run)["mean_m"]) == result["points"] > 500
-    assert result["valid_fraction"] > 0.5 and result.get("outlier_share", 1) == 1
+    assert result["valid_fraction"] > 0.5 and result["outlier_share"] == 1 and len(result["warnings"]) == 1
 
 
 @pytest.mark.parametrize("sensor", ["log_polar", "uniform", "every_pixel"])
@@ -107,7 +117,10 @@ def test_offset_axes_are_the_same_geometry(folder, capsys, plane):
         (["left=left.png", "right=nan.npy"], "NaN or infinite"),
         (["OWN", "baseline_m=0"], "baseline_m = 0: expected a positive number"),
         (["OWN", "focal_px=wide"], "focal_px = wide: expected a number"),
-        (["OWN", "disparity=left.png"], "disparity = left.png: expected a disparity map"),
+        (
+            ["OWN", "disparity=left.png"],
+            "disparity = left.png: expected the pixels that a stored 1 stands for (disparity_unit_px",
+        ),
         (["OWN", "disparity=half.npy"], "disparity = (80, 100)"),
         (["OWN", "cx_px=[1,2]"], "cx_px = [1, 2]: expected a number"),
         (["OWN", "cx_px=nan"], "cx_px = nan: expected a number"),
@@ -139,6 +152,140 @@ def test_a_mistake_is_one_line_and_leaves_nothing(folder, capsys, plane, overrid
     assert not list(folder.rglob("result.json")) and not list(folder.rglob("points.*"))
 
 
+def small(*more):
+    return [*more, "sensor.receptive_fields=1500"]
+
+
+def with_orientation(path, orientation):
+    """Give a JPEG file an EXIF orientation."""
+    data = Path(path).read_bytes()
+    entry = b"\x01\x12\x00\x03\x00\x00\x00\x01" + orientation.to_bytes(2, "big") + b"\x00\x00"
+    tiff = b"Exif\x00\x00MM\x00*\x00\x00\x00\x08\x00\x01" + entry + b"\x00\x00\x00\x00"
+    Path(path).write_bytes(data[:2] + b"\xff\xe1" + (len(tiff) + 2).to_bytes(2, "big") + tiff + data[2:])
+
+
+def refused(capsys, *overrides):
+    """The one line of a run that stops before any work is lost."""
+    before = set(Path.cwd().rglob("points.*"))
+    assert main(["sense", *overrides]) != 0
+    printed = capsys.readouterr().err
+    assert len(printed.splitlines()) == 1 and set(Path.cwd().rglob("points.*")) == before
+    return printed
+
+
+def test_pictures_that_cannot_be_this_pair_are_refused(folder, capsys, plane):
+    swapped = ["left=right.png", "right=left.png", *plane[2:]]
+    line = refused(capsys, *small(*swapped))
+    assert "100% of" in line and "beyond infinity" in line and "(health=warn goes on)" in line
+    assert len(sense(capsys, *small(*swapped), "health=warn")[1]["warnings"]) == 1
+    cv2.imwrite("low.png", np.roll(cv2.imread("right.png"), 4, 0))
+    assert "rows of" in refused(capsys, *small(*plane), "right=low.png")
+    assert "the same picture as left" in refused(capsys, *small(*plane), "right=left.png")
+    assert "health = strict: expected one of" in refused(capsys, *small(*plane), "health=strict")
+
+
+def test_a_turned_picture_is_refused_or_taken_as_it_is_stored(folder, capsys, plane):
+    for name in ("left", "right"):
+        cv2.imwrite(f"{name}.jpg", cv2.imread(f"{name}.png"), [cv2.IMWRITE_JPEG_QUALITY, 98])
+        with_orientation(f"{name}.jpg", 6)
+    cv2.imwrite("right.jpg", cv2.imread("right.png"), [cv2.IMWRITE_JPEG_QUALITY, 98])
+    assert cv2.imread("left.jpg").shape[:2] == SIZE[::-1]
+    overrides = small(*plane, "left=left.jpg", "right=right.jpg")
+    assert "left: its EXIF orientation turns the picture" in refused(capsys, *overrides)
+    _, result = sense(capsys, *overrides, "disparity=truth.pfm", "health=warn")
+    assert result["median_error_m"] < 0.02 and len(result["warnings"]) == 1
+    with_orientation("right.jpg", 1)
+    assert not read_picture(Path("right.jpg"), "right").turned
+
+
+@pytest.mark.parametrize("kind", ["12 bits in 16", "16 bits", "floating point"])
+def test_levels_are_what_they_were(folder, plane, kind):
+    """The same pictures stored in other types are the same pictures."""
+    ends = {"12 bits in 16": (4095, np.uint16, "png"), "16 bits": (65535, np.uint16, "png")}
+    scale, dtype, end = ends.get(kind, (255, np.float32, "npy"))
+    pictures = []
+    for name in ("left", "right"):
+        stored = np.rint(cv2.imread(f"{name}.png").astype(np.float64) * (scale / 255)).astype(dtype)
+        if end == "png":
+            cv2.imwrite(f"{name}_.png", stored)
+        else:
+            np.save(f"{name}_.npy", stored)
+        pictures.append(read_picture(Path(f"{name}_.{end}"), name))
+    left, _, faults = exposed(*pictures)
+    np.testing.assert_allclose(left.numpy(), cv2.imread("left.png").transpose(2, 0, 1) / 255, atol=0.5 / scale)
+    assert [fault.kind for fault in faults] == ["bits"] * (kind != "16 bits")
+
+
+def test_rows_that_are_a_little_apart_widen_the_covariances(folder, capsys, plane):
+    moved = cv2.warpAffine(cv2.imread("right.png"), np.float32([[1, 0, 0], [0, 1, 0.9]]), SIZE[::-1], borderMode=1)
+    cv2.imwrite("low.png", moved)
+    overrides = small(*plane, "right=low.png")
+    run, result = sense(capsys, *overrides)
+    (warning,) = result["warnings"]
+    assert result["rows_px"] == pytest.approx(0.9, abs=0.15) and "widened" in warning
+    without, plain = sense(capsys, *overrides, "health=off")
+    assert plain["rows_px"] == 0 and plain["points"] == result["points"]
+    assert (points_of(run)["inverse_range_std"] > points_of(without)["inverse_range_std"]).all()
+
+
+def test_a_foreign_disparity_in_other_units_is_refused(folder, capsys, plane):
+    np.save("raw.npy", np.full(SIZE, 12 * 16, np.int16))
+    np.save("good.npy", np.full(SIZE, 12, np.int16))
+    np.save("holes.npy", np.where(np.arange(SIZE[1]) % 9 == 0, 0, 12) * np.ones((SIZE[0], 1), np.int16))
+    external = small(*plane, "matcher=external", "budget=ours")
+    assert "matcher.source: 16 times what" in refused(capsys, *external, "matcher.source=raw.npy")
+    assert "of it is 0: expected NaN" in refused(capsys, *external, "matcher.source=holes.npy")
+    assert not sense(capsys, *external, "matcher.source=good.npy")[1]["warnings"]
+
+
+def test_a_truth_of_an_image_and_its_mask(folder, capsys, plane):
+    """Quarters of a pixel in 8 bits, and TIFF; what the mask hides or does not know is not judged."""
+    truth = np.full(SIZE, 12, np.float32)
+    truth[:, 100:] = 30  # wrong, and masked
+    truth[:40] = 0
+    cv2.imwrite("quarters.png", (truth * 4).astype(np.uint8))
+    cv2.imwrite("truth.tiff", np.where(truth == 0, np.nan, truth))
+    np.testing.assert_array_equal(
+        load_disparity("quarters.png", "disparity", 0.25)[0], load_disparity("truth.tiff", "disparity")[0]
+    )
+    np.testing.assert_array_equal(
+        load_disparity("truth.tiff", "disparity", unknown=30)[0][41:, 99:101], [[12, np.nan]] * 119
+    )
+    mask = np.full(SIZE, 255, np.uint8)
+    mask[:, 100:], mask[:40] = 128, 0
+    cv2.imwrite("mask.png", mask)
+    quarters = small(*plane, "disparity=quarters.png", "disparity_unit_px=0.25")
+    _, judged = sense(capsys, *quarters, "mask=mask.png")
+    assert judged["median_error_m"] < 0.02 and judged["outlier_share"] < 0.05 and judged["hidden_valid"] > 0.3
+    _, unmasked = sense(capsys, *quarters, "health=off")
+    assert unmasked["outlier_share"] > 0.3
+
+
+@pytest.mark.parametrize(
+    ("overrides", "line"),
+    [
+        (["mask=mask.png"], "mask = mask.png: expected null without a disparity"),
+        (["disparity=truth.pfm", "mask=gone.png"], "mask = gone.png: expected an existing file"),
+        (["disparity=truth.pfm", "mask=text.png"], "mask = text.png: expected a grey image"),
+        (["disparity=truth.pfm", "mask=none.png"], "mask = none.png: expected a mask that leaves something"),
+        (["disparity=truth.pfm", "mask=half.npy"], "mask = (80, 100): expected the disparity's (160, 200)"),
+        (["disparity=truth.pfm", "disparity_unit_px=0"], "disparity_unit_px = 0.0: expected the pixels"),
+        (["disparity=truth.pfm", "disparity_unknown=no"], "disparity_unknown = no: expected a number"),
+        (["span=all"], "span = all: expected one of whole, shorter"),
+    ],
+)
+def test_a_mistaken_mask_is_one_line(folder, capsys, plane, overrides, line):
+    Path("text.png").write_text("no image")
+    np.save("half.npy", np.ones((80, 100), bool))
+    cv2.imwrite("none.png", np.zeros(SIZE, np.uint8))
+    assert line in refused(capsys, *small(*plane), *overrides)
+
+
+def test_what_a_shorter_span_leaves_out_is_said(folder, capsys, plane):
+    _, result = sense(capsys, *small(*plane), "span=shorter")
+    assert result["image_seen"] == pytest.approx(math.pi * 80**2 / (160 * 200), abs=0.01)
+
+
 def test_an_image_without_texture_gives_no_points_and_no_error(folder, capsys):
     cv2.imwrite("grey.png", np.full(SIZE, 128, np.uint8))
     own = ["left=grey.png", "right=grey.png", "focal_px=180", "cx_px=99.5", "cy_px=79.5", "baseline_m=0.1"]
@@ -161,7 +308,7 @@ def test_disparity_files(tmp_path):
     (tmp_path / "b.npy").write_text("x")
     with pytest.raises(SettingError, match=r"disparity = .*b\.npy"):
         load_disparity(tmp_path / "b.npy", "disparity")
-    assert read_image(tmp_path / "a.npy", "left").shape == (3, 3, 4)
+    assert read_picture(tmp_path / "a.npy", "left").levels.shape == (3, 3, 4)
 
 
 def test_ply_reads_back(tmp_path):
@@ -169,6 +316,9 @@ def test_ply_reads_back(tmp_path):
     mean, cov, colour, inlier = rng.normal(size=(5, 3)), rng.random((5, 6)), rng.random((5, 3)), rng.random(5)
     write_ply(tmp_path / "p.ply", mean, cov, colour, inlier)
     head, body = (tmp_path / "p.ply").read_bytes().split(b"end_header\n")
+    assert (
+        b"comment frame: left camera, optical" in head and b"comment cov_: m^2, upper triangle by rows: xx xy" in head
+    )
     assert b"element vertex 5" in head and b"property float inlier" in head and b"property uchar blue" in head
     record = np.dtype([("f", "<f4", 10), ("c", "u1", 3)])
     read = np.frombuffer(body, record)

@@ -16,7 +16,7 @@ from torchfovea.memory.nearest import nearest_cell
 from torchfovea.sensing.camera import Camera
 from torchfovea.sensing.head import Eyes, to_ego
 
-__all__ = ["Cloud", "carried_colours", "cloud_of", "painted", "unpainted", "write_cloud", "write_ply"]
+__all__ = ["COVARIANCE", "Cloud", "carried_colours", "cloud_of", "painted", "unpainted", "write_cloud", "write_ply"]
 
 GREY = 0.5  # of points whose colour nobody saw
 FRAME = "the ego frame: x forward, y left, z up, origin where the neck's pan and tilt axes cross"

@@ -15,15 +15,22 @@ __all__ = ["check_maps", "load_disparity"]
 
 
 def load_disparity(
-    path: str | Path, setting: str = "matcher.source", span: tuple[float, float] = (0.0, 1.0)
+    path: str | Path,
+    setting: str = "matcher.source",
+    span: tuple[float, float] = (0.0, 1.0),
+    unit_px: float | None = None,
+    unknown: float | None = None,
 ) -> tuple[Tensor, Tensor | None]:
     """A disparity map, and its confidence where the file has one.
 
     Args:
-        path: NPZ with `disparity` (or one array alone) and perhaps `confidence`; NPY; PFM; or 16-bit PNG in 1/256 px
-            with 0 for unknown (KITTI's).
+        path: NPZ with `disparity` (or one array alone) and perhaps `confidence`; NPY; PFM; or a PNG, TIFF or PGM image,
+            in which 0 is unknown if its numbers are whole.
         setting: the name the user knows the path by.
         span: between which values a confidence lies.
+        unit_px: pixels that a stored 1 stands for; None: 1, and 1/256 in a PNG of 16 bits (KITTI's). Other images of
+            whole numbers need it (Middlebury's quarters: 0.25).
+        unknown: the stored number that stands for nothing, beside NaN.
 
     Returns:
         (H, W) float32 [px], not finite where unknown; and the confidence (H, W), or None.
@@ -34,15 +41,25 @@ def load_disparity(
     path = Path(path)
     require(path.is_file(), setting, path, "an existing file")
     suffix = path.suffix.lower()
-    readers = {".npz": _npz, ".npy": _npy, ".pfm": _pfm, ".png": _png}
-    require(suffix in readers, setting, path, "a file that ends in .npz, .npy, .pfm or .png")
+    readers = {".npz": _npz, ".npy": _npy, ".pfm": _pfm} | dict.fromkeys((".png", ".tif", ".tiff", ".pgm"), _image)
+    require(suffix in readers, setting, path, f"a file that ends in {', '.join(readers)}")
     try:
-        disparity, confidence = readers[suffix](path)
+        stored, sure = readers[suffix](path)
     except SettingError:
         raise
     except (ValueError, OSError, IndexError, EOFError) as error:
         raise SettingError(f"{setting} = {path}: expected a disparity map ({error})") from error
-    return check_maps(disparity, confidence, None, f"{setting} = {path}", span)
+    disparity, confidence = check_maps(stored, sure, None, f"{setting} = {path}", span)
+    if readers[suffix] is _image and stored.dtype.kind == "u":
+        if unit_px is None:
+            told = suffix == ".png" and stored.dtype.itemsize == 2
+            expected = "the pixels that a stored 1 stands for (disparity_unit_px of a truth), or a PNG of 16 bits"
+            require(told, setting, path, expected)
+            unit_px = 1 / 256
+        unknown = 0 if unknown is None else unknown
+    if unknown is not None:
+        disparity = torch.where(disparity == unknown, torch.nan, disparity)
+    return disparity if unit_px is None else disparity * unit_px, confidence
 
 
 def _npz(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
@@ -68,17 +85,21 @@ def _pfm(path: Path) -> tuple[np.ndarray, None]:
     return values.reshape(height, width)[::-1].astype(np.float32), None
 
 
-def _png(path: Path) -> tuple[np.ndarray, None]:
+def _image(path: Path) -> tuple[np.ndarray, None]:
     try:
         import cv2
     except ImportError as error:
         raise SettingError(
-            f"{path}: expected OpenCV, which comes with pip install 'torchfovea[stereo]', to read a PNG"
+            f"{path}: expected OpenCV, which comes with pip install 'torchfovea[stereo]', to read an image"
         ) from error
     values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if values is None or values.dtype != np.uint16:
-        raise ValueError("it is no PNG of 16 bits")
-    return np.where(values == 0, np.nan, values / np.float32(256)), None
+    if values is None:
+        raise ValueError("it is no image that OpenCV can read")
+    if values.ndim == 3 and bool((values == values[..., :1]).all()):
+        values = values[..., 0]
+    if values.ndim != 2 or values.dtype not in (np.uint8, np.uint16, np.float32):
+        raise ValueError("it is no grey image of 8 or 16 bits, or of floating point")
+    return values, None
 
 
 def check_maps(

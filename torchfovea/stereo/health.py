@@ -17,6 +17,7 @@ from torch import Tensor
 
 from torchfovea.sensing.camera import Camera
 from torchfovea.sensing.correspondence import Budget
+from torchfovea.setting import SettingError
 from torchfovea.stereo.sparse import SparseMatches
 from torchfovea.stereo.views import Views, grey_of
 
@@ -26,6 +27,7 @@ __all__ = [
     "disparity_faults",
     "full_scale",
     "geometry_faults",
+    "heed",
     "misaligned",
     "picture_faults",
     "placeholders",
@@ -59,6 +61,18 @@ class Fault(NamedTuple):
     serious: bool
 
 
+def heed(faults: list[Fault], strictly: bool) -> list[str]:
+    """The lines of faults, to be told.
+
+    Raises:
+        SettingError: if `strictly`, with the line of the first serious one.
+    """
+    for fault in faults:
+        if strictly and fault.serious:
+            raise SettingError(f"{fault.line} (health=warn goes on)")
+    return [fault.line for fault in faults]
+
+
 def full_scale(peak: float, nominal: float) -> float:
     """The level that stands for 1 in numbers of which the greatest is `peak`.
 
@@ -70,13 +84,13 @@ def full_scale(peak: float, nominal: float) -> float:
 
     Returns:
         `nominal`, unless the peak is above it or leaves two bits of 16 unused: then that of the fewest bits, of an even
-        number from 8, that hold the peak.
+        number from 8 to 16, that hold the peak.
     """
     fits = peak <= nominal * (1 + 1e-3)
     if fits and not (nominal == 2**16 - 1 and peak < 2**14):
         return nominal
     bits = max(8, 2 * math.ceil(math.log2(max(peak, 1.0) + 1) / 2))
-    return float(2**bits - 1)
+    return float(2**bits - 1) if bits <= 16 else nominal
 
 
 @torch.no_grad()
@@ -156,7 +170,8 @@ def geometry_faults(views: Views, matches: SparseMatches) -> tuple[list[Fault], 
             f"right: only {count} of {matches.tried} corners of the left picture are found in it: expected the other "
             "eye's view of the same moment, upright and near the same rows"
         )
-        return [Fault("unlike", line, True)], 0.0
+        # raw cameras may be turned as far as they like: their rows are only not checked
+        return [Fault("unlike", line, views.rectified)], 0.0
     if count < FEWEST:
         return [], 0.0
     found = []

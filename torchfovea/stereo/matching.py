@@ -17,7 +17,7 @@ from torchfovea.sensing.retina import Retina
 from torchfovea.stereo.exposure import alike
 from torchfovea.stereo.maps import checked_range, read_map
 from torchfovea.stereo.rectification import RectifiedPair, frame_to_match, image_frame
-from torchfovea.stereo.sgbm import SGBM, disparity_sgbm
+from torchfovea.stereo.sgbm import SGBM, check_room, disparity_sgbm
 from torchfovea.stereo.views import Views
 from torchfovea.stereo.visibility import undisputed
 
@@ -31,6 +31,7 @@ def match_sgbm(
     budget: Budget | None = None,
     nearest_range_m: float = 0.3,
     farthest_range_m: float = math.inf,
+    most_bytes: float = math.inf,
 ) -> tuple[Correspondences, Disparity]:
     """Match two images through retinas.
 
@@ -41,6 +42,7 @@ def match_sgbm(
         budget: the error budget; its `source_px` is replaced by the images' own size unless it is None.
         nearest_range_m: nearest depth that can be matched; it sets the search range.
         farthest_range_m: correspondences that triangulate to a greater depth are invalid.
+        most_bytes: that the matcher may need for its costs; its mode and the search range decide.
 
     Returns:
         Correspondences (N, ...) in the pixels of `Views.cameras`, one per RF of the left eye, and the disparity they
@@ -48,8 +50,8 @@ def match_sgbm(
         without a disparity (occluded, ambiguous, textureless), and depths out of range.
 
     Raises:
-        SettingError: for a batch of images, impossible ranges, views that need a retina without one, and without
-            OpenCV.
+        SettingError: for a batch of images, impossible ranges, views that need a retina without one, more costs than
+            the machine or `most_bytes` has room for, and without OpenCV.
     """
     params, budget = params or SGBM(), views.told(budget)
     span = checked_range(nearest_range_m, farthest_range_m)
@@ -58,6 +60,7 @@ def match_sgbm(
         frame = image_frame(views, retina)
     else:
         frame = frame_to_match(views, retina, nearest_range_m, params.rectified_fov_deg, search)
+    check_room(frame.size, search, params, most_bytes)
     pair = alike(views.grey().detach())
     left_px, right_px, ahead = frame.seen(pair)
     shown = frame.kept(pair, left_px, right_px)[:, 0]

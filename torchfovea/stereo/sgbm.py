@@ -7,6 +7,7 @@ Not differentiable. OpenCV is imported on the first call; it comes with the extr
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass
 from types import ModuleType
 from typing import ClassVar
@@ -15,7 +16,7 @@ import numpy as np
 
 from torchfovea.setting import SettingError, require
 
-__all__ = ["SGBM", "disparity_sgbm"]
+__all__ = ["SGBM", "check_room", "disparity_sgbm"]
 
 MODES = ("sgbm", "3way", "hh")
 
@@ -112,6 +113,30 @@ SGBM.authors = SGBM(
     first_disparity_px=0,
     disparities=80,
 )
+
+
+def check_room(size: tuple[int, int], search: tuple[int, int], params: SGBM, most_bytes: float = math.inf) -> None:
+    """Refuse pictures whose costs do not fit into memory, before the system ends the program.
+
+    Args:
+        size: height and width of the pictures [px].
+        search: the first disparity searched and one past the last.
+        params: of the matcher; its mode `hh` keeps two costs of 16 bits for every pixel and disparity, the others a few
+            rows of them.
+        most_bytes: the most that is allowed; never more than the machine has.
+
+    Raises:
+        SettingError: for more.
+    """
+    height, width = size
+    cells = (search[1] - search[0]) * width * (height if params.mode == "hh" else params.block_px + 2)
+    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
+        most_bytes = min(most_bytes, float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")))
+    what = f"{search[1] - search[0]} for {width} x {height} px, {4e-9 * cells:.1f} GB"
+    expected = (
+        f"at most {1e-9 * most_bytes:.1f} GB (a greater matcher.nearest_range_m, matcher.mode=sgbm, matcher=sweep)"
+    )
+    require(4 * cells <= most_bytes, "matcher.disparities", what, expected)
 
 
 def disparity_sgbm(

@@ -12,23 +12,26 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from torchfovea.cloud import write_ply
-from torchfovea.commands.sense.report import beside, match_figures, read_at_fields
+from torchfovea.cloud import COVARIANCE, write_ply
+from torchfovea.commands.sense.checks import examine, examine_map, health_of
+from torchfovea.commands.sense.report import beside, image_seen, match_figures, read_at_fields
 from torchfovea.commands.shared.budgets import build_budget
 from torchfovea.commands.shared.build import build_match, build_sensor, choice, name_of
 from torchfovea.commands.shared.config import run_folder
-from torchfovea.commands.shared.pairs import gaze_of, load_pair
+from torchfovea.commands.shared.pairs import Pair, gaze_of, load_pair
 from torchfovea.commands.shared.unread import refuse_unread
 from torchfovea.files import replacing, write_result
 from torchfovea.gaussian import Gaussian, columns
 from torchfovea.sensing.chart import cartesian_from_inverse_range
-from torchfovea.sensing.correspondence import Budget, Correspondences
+from torchfovea.sensing.correspondence import Budget, Correspondences, Disparity
 from torchfovea.sensing.head import Eyes
 from torchfovea.sensing.kinship import once_a_pixel
 from torchfovea.sensing.layout import Retina
 from torchfovea.sensing.triangulation import Observations, observe
 from torchfovea.sensing.unscented import SigmaPoints
 from torchfovea.setting import SettingError, require
+from torchfovea.stereo.external import External
+from torchfovea.stereo.health import misaligned
 from torchfovea.stereo.matchers import Match, Matcher, checked_matches
 from torchfovea.stereo.matching import match_sgbm
 from torchfovea.stereo.sgbm import SGBM
@@ -38,6 +41,8 @@ from torchfovea.studies.calibration import mixture_std
 __all__ = ["Sensed", "run", "sense"]
 
 FRAME = "the left camera's frame: x right, y down, z forward"
+PLAIN_BYTES = 1_000_000_000
+UNITS = "mean_m m, cov_m2 m^2, left_px retinal px, left_image_px px, inverse_range 1/m; direction has length 1"
 
 
 class Sensed(NamedTuple):
@@ -63,39 +68,57 @@ def run(cfg: DictConfig) -> float | None:
     refuse_unread("sensor.fov_deg", "sensor.camera", "sensor.sample")
     every = name_of(cfg, "sensor", "layout") == "every_pixel"
     retina = None if every else build_sensor(cfg)[1]  # the field of view is the images' own
-    match, pair, folder = build_match(cfg), load_pair(cfg), run_folder()
+    match, pair, health = build_match(cfg), load_pair(cfg), health_of(cfg)
     raw = retina is None and pair.rig is not None
     require(not raw, "sensor.layout", "every_pixel", "a retina (sensor=log_polar or uniform) for raw images")
     views, budget = pair.views(gaze_of(cfg, pair)), build_budget(cfg, pair=True)
+    views = views.whole() if choice(cfg, "span", ("whole", "shorter")) == "whole" else views
     printed = choice(cfg, "budget.sigma_points", ("ours", "paper")) == "paper"
+    found_out = examine(pair, views, health)
+    pair, told = pair._replace(disparity=found_out.disparity), found_out.warnings
+    budget, folder = misaligned(budget, found_out.rows_px), run_folder()
 
     matches, found = _matched(match, views, retina, budget)
+    foreign = isinstance(match, Matcher) and isinstance(match.params, External) and views.rectified
+    if foreign and isinstance(found, Disparity) and found_out.matches is not None:
+        told += examine_map(found.disparity, found.valid, found_out.matches, views, health)
     sensed = sense(views, retina, matches, SigmaPoints.paper() if printed else None, not printed)
-    _write(folder, sensed)
-    observed, points = sensed.observed, sensed.points
-    figures: dict[str, Any] = match_figures(pair, views, retina, matches.left_px, observed, points, sensed.chosen)
+    _write(folder, sensed, views, retina)
     # from here on nothing can lose the points
-    refused: SettingError | None = None
+    observed, points = sensed.observed, sensed.points
+    figures: dict[str, float] = {"image_seen": image_seen(views, retina), "rows_px": found_out.rows_px}
+    figures |= match_figures(pair, views, retina, matches.left_px, observed, points, sensed.chosen)
     if pair.disparity is not None and retina is not None:
         try:
-            ours = match if isinstance(match, Matcher) else Matcher(SGBM())
-            params = ours.params if isinstance(ours.params, SGBM) else SGBM()
-            _, plain = match_sgbm(views, None, params, budget, ours.nearest_m)
-            again = read_at_fields(plain.disparity, views, retina, plain.valid)
-            figures |= beside(pair, views, retina, observed, points, again)
+            figures |= _beside_plain(match, pair, views, retina, budget, sensed)
         except SettingError as error:
-            refused = error
+            told.append(f"not judged beside plain matching: {error}")
     from torchfovea.commands.sense.pictures import draw_sense
 
     draw_sense(folder / "sense.png", pair.left, found, retina, observed, matches.left_px)
-    write_result(folder, figures)
+    write_result(folder, {**figures, "warnings": told})
     grid = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     for name, value in figures.items():
         grid.add_row(name, f"{value:.4g}")
     Console().print(grid)
-    if refused is not None:
-        Console(stderr=True).print(f"sense: not judged beside plain matching: {refused}", highlight=False, markup=False)
+    for line in told:
+        Console(stderr=True, soft_wrap=True).print(f"sense: {line}", highlight=False, markup=False)
     return figures.get("median_error_m")
+
+
+def _beside_plain(
+    match: Match, pair: Pair, views: Views, retina: Retina, budget: Budget, sensed: Sensed
+) -> dict[str, float]:
+    """Block matching of the images themselves at the same receptive fields.
+
+    Raises:
+        SettingError: where it cannot match them, or only in more than a gigabyte.
+    """
+    ours = match if isinstance(match, Matcher) else Matcher(SGBM())
+    params = ours.params if isinstance(ours.params, SGBM) else SGBM()
+    _, plain = match_sgbm(views, None, params, budget, ours.nearest_m, most_bytes=PLAIN_BYTES)
+    again = read_at_fields(plain.disparity, views, retina, plain.valid)
+    return beside(pair, views, retina, sensed.observed, sensed.points, again)
 
 
 def _matched(match: Match, views: Views, retina: Retina | None, budget: Budget) -> tuple[Correspondences, Any]:
@@ -138,9 +161,11 @@ def _doubted(observed: Observations) -> Observations:
     return observed._replace(cov=columns(aa, ab, factor * ar, bb, factor * br, factor.square() * variance))
 
 
-def _write(folder: Path, sensed: Sensed) -> None:
-    """points.ply and points.npz: the valid points alone, one a source pixel."""
+def _write(folder: Path, sensed: Sensed, views: Views, retina: Retina | None) -> None:
+    """points.ply and points.npz: the valid points alone, one a source pixel; with their frame, units and order."""
     keep = sensed.chosen
+    left_px = sensed.matches.left_px[keep]
+    image_px = left_px * views.scale(retina) + left_px.new_tensor(views.origin_px(retina))
     mean, cov, colour = (t[keep].numpy() for t in (sensed.points.mean, sensed.points.cov, sensed.colour))
     inlier = sensed.observed.inlier
     inlier = torch.ones_like(sensed.observed.mean[:, 2]) if inlier is None else inlier
@@ -152,8 +177,12 @@ def _write(folder: Path, sensed: Sensed) -> None:
             cov_m2=cov,
             colour=colour,
             inlier=inlier[keep].numpy(),
-            left_px=sensed.matches.left_px[keep].numpy(),
+            left_px=left_px.numpy(),
+            left_image_px=image_px.numpy(),
             direction=sensed.observed.direction[keep].numpy(),
             inverse_range=sensed.observed.mean[keep, 2].numpy(),
             inverse_range_std=sensed.observed.cov[keep, 5].sqrt().numpy(),
+            frame=np.array(FRAME),
+            units=np.array(UNITS),
+            cov_order=np.array(COVARIANCE),
         )

@@ -22,6 +22,8 @@ from matplotlib.figure import Figure
 
 __all__ = ["draw_sense"]
 
+SHOWN_PX = 1000
+
 
 def draw_sense(path: Path, left: Tensor, found: Any, retina: Retina | None, observed: Observations, px: Tensor) -> None:
     """Draw a sensed pair: the left image, what the matcher found, each point's range and its relative uncertainty.
@@ -36,11 +38,15 @@ def draw_sense(path: Path, left: Tensor, found: Any, retina: Retina | None, obse
     """
     figure = Figure(figsize=(17, 9.5), layout="constrained")
     axes = figure.subplots(2, 2)
-    axes[0, 0].imshow(np.asarray(left.movedim(0, -1)).clip(0, 1))
+    step = max(1, max(left.shape[-2:]) // SHOWN_PX)  # as fine as it is drawn
+    height, width = left.shape[-2:]
+    extent = (-0.5, width - 0.5, height - 0.5, -0.5)
+    axes[0, 0].imshow(np.asarray(left[:, ::step, ::step].movedim(0, -1)).clip(0, 1), extent=extent)
     axes[0, 0].set_title("left image")
     if isinstance(found, Disparity | SweepRange):
-        values, name = found_map(found, retina, min(left.shape[-2:]))
-        figure.colorbar(axes[0, 1].imshow(values, cmap="viridis"), ax=axes[0, 1])
+        values, name = found_map(found, retina, min(*left.shape[-2:], SHOWN_PX))
+        step = max(1, max(values.shape) // SHOWN_PX)
+        figure.colorbar(axes[0, 1].imshow(values[::step, ::step], cmap="viridis"), ax=axes[0, 1])
         axes[0, 1].set_title(name)
     keep = observed.valid & (observed.mean[:, 2] > 0)
     rho, sigma = observed.mean[keep, 2], observed.cov[keep, 5].sqrt()

@@ -9,13 +9,13 @@ from torch import Tensor
 
 from torchfovea.commands.shared.pairs import Pair
 from torchfovea.commands.shared.regions import hidden_places
-from torchfovea.gaussian import Gaussian
+from torchfovea.gaussian import Gaussian, columns
 from torchfovea.sensing.layout import Retina
 from torchfovea.sensing.triangulation import Observations
 from torchfovea.stereo.maps import match_disparity
 from torchfovea.stereo.views import Views
 
-__all__ = ["beside", "match_figures", "read_at_fields"]
+__all__ = ["beside", "image_seen", "match_figures", "read_at_fields"]
 
 LEVELS = (0.5, 0.9, 0.95, 0.99)
 OUTLIER = 5.0  # standard deviations
@@ -41,7 +41,8 @@ def match_figures(
     """
     valid = observed.valid
     area = torch.ones_like(px[:, 0]) if retina is None else retina.width_px(px).square()
-    kinds = {"": torch.ones_like(area), "_by_area": area}
+    on = views.holds(px, retina).to(area)
+    kinds = {"": on, "_by_area": area * on}
     inlier = valid.to(area) if observed.inlier is None else observed.inlier
     figures: dict[str, float] = {"points": int(chosen.sum())}
     figures |= {f"valid_fraction{k}": _mean(valid, w) for k, w in kinds.items()}
@@ -50,14 +51,14 @@ def match_figures(
         return figures
     depth = pair.depth_m(read_at_fields(pair.disparity, views, retina))
     length = views.cameras(retina)[0].rays(px).norm(dim=-1)
-    hidden = read_at_fields(hidden_places(pair.disparity).float(), views, retina) > 0.5
-    known = torch.isfinite(depth)
+    seen = ~hidden_places(pair.disparity) if pair.seen is None else pair.seen
+    known, hidden = torch.isfinite(depth), ~_at_fields(seen, views, retina, px)
     error = observed.mean[:, 2] - 1 / (depth * length)
     z = (error / observed.cov[:, 5].sqrt()).abs()
     miss = (points.mean[:, 2] - depth).abs()
     for suffix, weight in kinds.items():
         figures[f"hidden_valid{suffix}"] = _mean(valid, weight * (hidden & known))
-        here = weight * (valid & known)
+        here = weight * (valid & known & ~hidden) if pair.seen is not None else weight * (valid & known)
         if not bool(here.any()):
             continue
         figures[f"median_error_m{suffix}"] = _median(miss, here)
@@ -92,6 +93,24 @@ def read_at_fields(values: Tensor, views: Views, retina: Retina | None, valid: T
     found, _ = match_disparity(values, views, retina, nearest_range_m=1e-3, valid=valid)
     shift = (found.left_px - found.right_px)[:, 0] * views.scale(retina)
     return torch.where(found.valid, shift, torch.full_like(shift, torch.nan))
+
+
+def image_seen(views: Views, retina: Retina | None) -> float:
+    """Share of the left image that lies on the retina."""
+    if retina is None:
+        return 1.0
+    height, width = views.left.shape[-2:]
+    row, column = (torch.arange(0, n, max(1, n // 500), dtype=torch.float64) for n in (height, width))
+    place = columns(*torch.broadcast_tensors(column, row[:, None]))
+    there = (place - place.new_tensor(views.origin_px(retina))) / views.scale(retina)
+    return float(retina.inside(there).double().mean())
+
+
+def _at_fields(mask: Tensor, views: Views, retina: Retina | None, px: Tensor) -> Tensor:
+    """A mask (H, W) at the receptive fields, bool (N,); the nearest border's beyond the image."""
+    height, width = mask.shape
+    place = (px * views.scale(retina) + px.new_tensor(views.origin_px(retina))).round().long()
+    return mask[place[:, 1].clamp(0, height - 1), place[:, 0].clamp(0, width - 1)]
 
 
 def _mean(values: Tensor, weight: Tensor) -> float:

@@ -1,27 +1,41 @@
-"""Reading images that users have."""
+"""Reading the two images of a pair as users have them."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchfovea.setting import SettingError, require
+from torchfovea.stereo.health import Fault, full_scale
 
-__all__ = ["read_image"]
+__all__ = ["Picture", "exposed", "read_picture"]
+
+NOMINAL = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
 
 
-def _exists(path: Path, setting: str) -> None:
-    require(path.is_file(), setting, path, "an existing file")
+class Picture(NamedTuple):
+    """An image file.
+
+    Attributes:
+        levels: (3, H, W), as they are stored, in floating point.
+        nominal: the level that stands for 1 by the file's type.
+        turned: whether its EXIF orientation turns or mirrors it; the levels are as they are stored.
+    """
+
+    levels: Tensor
+    nominal: float
+    turned: bool
 
 
-def read_image(path: Path, setting: str) -> Tensor:
-    """An image as (3, H, W) in [0, 1].
+def read_picture(path: Path, setting: str) -> Picture:
+    """An image as it is stored.
 
     Args:
-        path: anything that OpenCV reads, or NPY and NPZ arrays (H, W) or (H, W, 3), bytes or in [0, 1].
+        path: anything that OpenCV reads, or NPY and NPZ arrays (H, W) or (H, W, 3).
         setting: the name of the setting, for errors.
 
     Raises:
@@ -29,20 +43,49 @@ def read_image(path: Path, setting: str) -> Tensor:
     """
     import cv2
 
-    _exists(path, setting)
+    require(path.is_file(), setting, path, "an existing file")
+    turned = False
     if path.suffix.lower() in (".npy", ".npz"):
         pixels = _array(path, setting)
         pixels = np.repeat(pixels[..., None], 3, -1) if pixels.ndim == 2 else pixels
-        require(pixels.ndim == 3 and pixels.shape[-1] == 3, setting, pixels.shape, "an array (H, W) or (H, W, 3)")
+        fits = pixels.ndim == 3 and pixels.shape[-1] == 3 and pixels.size > 0 and pixels.dtype.kind in "bfiu"
+        require(fits, setting, (*pixels.shape, str(pixels.dtype)), "an array (H, W) or (H, W, 3) of numbers")
     else:
-        loaded = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        how = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
+        loaded = cv2.imread(str(path), how | cv2.IMREAD_IGNORE_ORIENTATION)
         if loaded is None:
             raise SettingError(f"{setting} = {path}: expected an image that OpenCV can read")
+        with path.open("rb") as file:
+            tagged = b"exif" in file.read(2**16).lower()
+        upright = cv2.imread(str(path), how) if tagged else None
+        turned = upright is not None and not np.array_equal(loaded, upright)
         pixels = cv2.cvtColor(loaded, cv2.COLOR_BGR2RGB)
-    scale = 255.0 if pixels.dtype == np.uint8 else 1.0
-    image = torch.from_numpy(np.ascontiguousarray(pixels)).float().movedim(-1, 0) / scale
-    require(bool(torch.isfinite(image).all()), setting, f"{path} with NaN or infinite pixels", "finite values")
-    return image
+    nominal = NOMINAL.get(pixels.dtype, 1.0)
+    levels = torch.from_numpy(np.ascontiguousarray(pixels, np.float32)).movedim(-1, 0)
+    require(bool(torch.isfinite(levels).all()), setting, f"{path} with NaN or infinite pixels", "finite values")
+    return Picture(levels, nominal, turned)
+
+
+def exposed(left: Picture, right: Picture) -> tuple[Tensor, Tensor, list[Fault]]:
+    """Both images in [0, 1], by the bits that their levels use, and what is wrong with the files."""
+    found = []
+    for name, picture in (("left", left), ("right", right)):
+        if picture.turned:
+            line = f"{name}: its EXIF orientation turns the picture: expected pixels as the calibration knows them; "
+            found.append(Fault("exif", f"{line}store it upright without the tag (else it is taken as stored)", True))
+    one = left.nominal == right.nominal
+    peaks = [float(picture.levels.max()) for picture in (left, right)]
+    images = []
+    for name, picture, peak in zip(("left", "right"), (left, right), peaks, strict=True):
+        scale = full_scale(max(peaks) if one else peak, picture.nominal)
+        if scale != picture.nominal and (not one or name == "left"):
+            bits = round(np.log2(scale + 1))
+            who = "left, right" if one else name
+            kind = "floating point" if picture.nominal == 1 else "16 bits"
+            line = f"{who}: levels up to {max(peaks) if one else peak:g} in {kind}: taken for {bits} bits"
+            found.append(Fault("bits", line, False))
+        images.append(picture.levels / scale)
+    return images[0], images[1], found
 
 
 def _array(path: Path, setting: str) -> np.ndarray:

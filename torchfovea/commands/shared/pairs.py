@@ -11,12 +11,14 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from torchfovea.commands.shared.cameras import cameras_of
-from torchfovea.commands.shared.images import read_image
+from torchfovea.commands.shared.images import exposed, read_picture
 from torchfovea.commands.shared.settings import choice, is_number
+from torchfovea.commands.shared.truth import load_truth
 from torchfovea.sensing.camera import Camera, Pinhole
 from torchfovea.setting import SettingError, require
 from torchfovea.stereo.calibration_files import StereoCalibration, load_calibration
 from torchfovea.stereo.disparity_files import load_disparity
+from torchfovea.stereo.health import Fault
 from torchfovea.stereo.rig import StereoRig
 from torchfovea.stereo.views import Views, posed_views, rectified_views
 
@@ -36,6 +38,8 @@ class Pair(NamedTuple):
         baseline_m: between the cameras.
         disparity: the truth of a rectified pair, (H, W), not finite where unknown; or None.
         rig: how cameras stand whose images are raw; None: the pair is rectified.
+        seen: bool (H, W), what both eyes see, by a mask; None: not told.
+        faults: what is wrong with the files.
     """
 
     left: Tensor
@@ -45,6 +49,8 @@ class Pair(NamedTuple):
     baseline_m: float
     disparity: Tensor | None
     rig: StereoRig | None = None
+    seen: Tensor | None = None
+    faults: tuple[Fault, ...] = ()
 
     def views(self, gaze_px: tuple[float, float] | None) -> Views:
         """What a matcher is given of it, with retinas that look at a pixel (column, row), or at the middle."""
@@ -72,15 +78,15 @@ def load_pair(cfg: DictConfig) -> Pair:
     for name in ("left", "right"):
         if cfg[name] is None:
             raise SettingError(f"{name} = null: expected an image file (or pair=motorcycle)")
-    left, right = (read_image(_file(cfg, name), name) for name in ("left", "right"))
-    _alike(left, right, "right")
+    left, right, faults = _images(_file(cfg, "left"), _file(cfg, "right"))
     height, width = left.shape[-2:]
     cameras = cameras_of(cfg, (width, height))
     raw = cfg.disparity is not None and not cameras.rectified
     require(not raw, "disparity", cfg.disparity, "null for raw images: a disparity is that of a rectified pair")
-    truth = None if cfg.disparity is None else load_disparity(_file(cfg, "disparity"), "disparity")[0]
+    truth, seen = load_truth(cfg)
     _fits(truth, left, "disparity")
-    return _pair(left, right, cameras, truth)
+    _fits(seen, left, "mask")
+    return _pair(left, right, cameras, truth)._replace(seen=seen, faults=faults)
 
 
 def named_pair(name: Any, where: str) -> Pair:
@@ -101,8 +107,7 @@ def load_folder(folder: Path, where: str) -> Pair:
         SettingError: for what is missing or does not fit.
     """
     require(folder.is_dir(), where, folder, "motorcycle, or a folder with left.png, right.png, calib.txt and disparity")
-    left, right = (read_image(folder / f"{name}.png", f"{where}: {name}") for name in ("left", "right"))
-    _alike(left, right, f"{where}: right")
+    left, right, faults = _images(folder / "left.png", folder / "right.png", f"{where}: ")
     found = [folder / f"disparity{suffix}" for suffix in SUFFIXES if (folder / f"disparity{suffix}").is_file()]
     require(len(found) == 1, f"{where}: {folder}/disparity", len(found), "one file (.npy, .npz, .pfm or .png)")
     truth = load_disparity(found[0], f"{where}: disparity")[0]
@@ -113,7 +118,7 @@ def load_folder(folder: Path, where: str) -> Pair:
     except SettingError as error:
         raise SettingError(f"{where}: {error}") from error
     require(cameras.rectified, f"{where}: {calibration}", "raw cameras", "those of a rectified pair")
-    return _pair(left, right, cameras, truth)
+    return _pair(left, right, cameras, truth)._replace(faults=faults)
 
 
 def motorcycle() -> Pair:
@@ -147,6 +152,15 @@ def gaze_of(cfg: DictConfig, pair: Pair) -> tuple[float, float] | None:
     return column, row
 
 
+def _images(left: Path, right: Path, where: str = "") -> tuple[Tensor, Tensor, tuple[Fault, ...]]:
+    """Both images in [0, 1], and what is wrong with their files."""
+    one, other = (read_picture(path, f"{where}{name}") for path, name in ((left, "left"), (right, "right")))
+    size, found = (f"{p.levels.shape[-1]}x{p.levels.shape[-2]} px" for p in (one, other))
+    require(size == found, f"{where}right", found, f"the left image's {size}")
+    *images, faults = exposed(one, other)
+    return images[0], images[1], tuple(faults)
+
+
 def _file(cfg: DictConfig, name: str) -> Path:
     require(isinstance(cfg[name], str), name, cfg[name], "a file's name")
     return Path(cfg[name])
@@ -155,11 +169,6 @@ def _file(cfg: DictConfig, name: str) -> Path:
 def _pair(left: Tensor, right: Tensor, cameras: StereoCalibration, truth: Tensor | None) -> Pair:
     rig = None if cameras.rectified else cameras.rig
     return Pair(left, right, cameras.left, cameras.right, cameras.rig.baseline_m, truth, rig)
-
-
-def _alike(left: Tensor, right: Tensor, where: str) -> None:
-    size, other = (f"{image.shape[-1]}x{image.shape[-2]} px" for image in (left, right))
-    require(left.shape == right.shape, where, other, f"the left image's {size}")
 
 
 def _fits(truth: Tensor | None, image: Tensor, where: str) -> None:

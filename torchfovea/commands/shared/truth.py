@@ -1,0 +1,78 @@
+"""The true disparity of a user's pair, and the mask of what both eyes see."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+
+from torchfovea.setting import SettingError, require
+from torchfovea.stereo.disparity_files import load_disparity
+
+__all__ = ["load_mask", "load_truth"]
+
+
+def load_truth(cfg: DictConfig) -> tuple[Tensor | None, Tensor | None]:
+    """The settings `disparity`, `disparity_unit_px`, `disparity_unknown` and `mask`.
+
+    Returns:
+        The truth (H, W) [px], not finite where it is unknown; and bool (H, W), what both eyes see; or None for either.
+
+    Raises:
+        SettingError: for files that are not such maps.
+    """
+    unit, unknown = (_number(cfg, name) for name in ("disparity_unit_px", "disparity_unknown"))
+    require(unit is None or unit != 0, "disparity_unit_px", unit, "the pixels that a stored 1 stands for")
+    if cfg.disparity is None:
+        for name in ("disparity_unit_px", "disparity_unknown", "mask"):
+            require(OmegaConf.select(cfg, name) is None, name, OmegaConf.select(cfg, name), "null without a disparity")
+        return None, None
+    require(isinstance(cfg.disparity, str), "disparity", cfg.disparity, "a file's name")
+    truth, _ = load_disparity(Path(cfg.disparity), "disparity", unit, unknown)
+    name = OmegaConf.select(cfg, "mask")
+    if name is None:
+        return truth, None
+    require(isinstance(name, str), "mask", name, "a file's name")
+    known, seen = load_mask(Path(name), "mask")
+    require(known.shape == truth.shape, "mask", tuple(known.shape), f"the disparity's {tuple(truth.shape)}")
+    return torch.where(known, truth, torch.nan), seen
+
+
+def load_mask(path: Path, setting: str) -> tuple[Tensor, Tensor]:
+    """Where a truth is known, and what both eyes see, bool (H, W) each.
+
+    Args:
+        path: an image or an NPY array. Its greatest value marks what both eyes see, 0 what is unknown, and anything
+            between what only the left eye sees (Middlebury's mask0nocc.png: 255, 0 and 128).
+        setting: the name of the setting, for errors.
+
+    Raises:
+        SettingError: for a file that is missing or no such map.
+    """
+    import cv2
+
+    require(path.is_file(), setting, path, "an existing file")
+    try:
+        values = (
+            np.load(path, allow_pickle=False) if path.suffix == ".npy" else cv2.imread(str(path), cv2.IMREAD_ANYDEPTH)
+        )
+    except (ValueError, OSError, EOFError) as error:
+        raise SettingError(f"{setting} = {path}: expected an image or an NPY array ({error})") from error
+    fits = isinstance(values, np.ndarray) and values.ndim == 2 and values.size > 0 and values.dtype.kind in "bu"
+    require(fits, setting, path, "a grey image, or an NPY array (H, W) of bool or unsigned whole numbers")
+    assert isinstance(values, np.ndarray)
+    require(bool(values.any()), setting, path, "a mask that leaves something to judge")
+    return torch.from_numpy(values > 0), torch.from_numpy(values == values.max())
+
+
+def _number(cfg: DictConfig, name: str) -> float | None:
+    value = OmegaConf.select(cfg, name)
+    if value is None:
+        return None
+    number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    require(number, name, value, "a number")
+    return float(value)
