@@ -9,6 +9,7 @@ Nothing here is differentiable.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -61,7 +62,7 @@ class Fault(NamedTuple):
     serious: bool
 
 
-def heed(faults: list[Fault], strictly: bool) -> list[str]:
+def heed(faults: Sequence[Fault], strictly: bool) -> list[str]:
     """The lines of faults, to be told.
 
     Raises:

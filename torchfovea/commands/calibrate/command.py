@@ -25,6 +25,7 @@ from torchfovea.files import write_csv, write_result
 from torchfovea.sensing.correspondence import Budget
 from torchfovea.setting import require
 from torchfovea.stereo.external import External
+from torchfovea.stereo.health import heed
 from torchfovea.stereo.matchers import Matcher
 from torchfovea.studies.calibration import Judged, concatenate, inlier_of, judge, select, sigma_of
 from torchfovea.studies.fitting import BudgetFit, Likelihood, claim_rank, fit_budget, least_match_px
@@ -147,6 +148,7 @@ def _pairs(cfg: DictConfig, budget: Budget, matcher: Matcher) -> dict[str, Split
         found[title] = Split(data, data, [look], [], left_out=True)
     if cfg.real:
         pair = load_pair(cfg)
+        heed(pair.faults, True)
         look = look_at_pair(pair, retina, gaze_of(cfg, pair), budget, matcher)
         column = look.data.place_px[:, 0]
         # the retina looks at the picture's middle, or at the gaze

@@ -67,7 +67,7 @@ class Pair(NamedTuple):
 
 
 def load_pair(cfg: DictConfig) -> Pair:
-    """The pair that a configuration names.
+    """The pair that a configuration names, with the faults of its files.
 
     Raises:
         SettingError: for a missing file or calibration, numbers that no camera has, or images of different sizes.
