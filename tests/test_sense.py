@@ -10,7 +10,7 @@ import pytest
 
 from torchfovea.cli import main
 from torchfovea.cloud import write_ply
-from torchfovea.commands.shared.images import exposed, read_picture
+from torchfovea.commands.shared.images import exposed, read_levels
 from torchfovea.setting import SettingError
 from torchfovea.stereo.disparity_files import load_disparity
 
@@ -195,7 +195,7 @@ def test_a_turned_picture_is_refused_or_taken_as_it_is_stored(folder, capsys, pl
     _, result = sense(capsys, *overrides, "disparity=truth.pfm", "health=warn")
     assert result["median_error_m"] < 0.02 and len(result["warnings"]) == 1
     with_orientation("right.jpg", 1)
-    assert not read_picture(Path("right.jpg"), "right").turned
+    assert not read_levels(Path("right.jpg"), "right").turned
 
 
 @pytest.mark.parametrize("kind", ["12 bits in 16", "16 bits", "floating point"])
@@ -210,7 +210,7 @@ def test_levels_are_what_they_were(folder, plane, kind):
             cv2.imwrite(f"{name}_.png", stored)
         else:
             np.save(f"{name}_.npy", stored)
-        pictures.append(read_picture(Path(f"{name}_.{end}"), name))
+        pictures.append(read_levels(Path(f"{name}_.{end}"), name))
     left, _, faults = exposed(*pictures)
     np.testing.assert_allclose(left.numpy(), cv2.imread("left.png").transpose(2, 0, 1) / 255, atol=0.5 / scale)
     assert [fault.kind for fault in faults] == ["bits"] * (kind != "16 bits")
@@ -246,7 +246,7 @@ def test_a_truth_of_an_image_and_its_mask(folder, capsys, plane):
     cv2.imwrite("quarters.png", (truth * 4).astype(np.uint8))
     cv2.imwrite("truth.tiff", np.where(truth == 0, np.nan, truth))
     np.testing.assert_array_equal(
-        load_disparity("quarters.png", "disparity", 0.25)[0], load_disparity("truth.tiff", "disparity")[0]
+        load_disparity("quarters.png", "disparity", unit_px=0.25)[0], load_disparity("truth.tiff", "disparity")[0]
     )
     np.testing.assert_array_equal(
         load_disparity("truth.tiff", "disparity", unknown=30)[0][41:, 99:101], [[12, np.nan]] * 119
@@ -308,7 +308,7 @@ def test_disparity_files(tmp_path):
     (tmp_path / "b.npy").write_text("x")
     with pytest.raises(SettingError, match=r"disparity = .*b\.npy"):
         load_disparity(tmp_path / "b.npy", "disparity")
-    assert read_picture(tmp_path / "a.npy", "left").levels.shape == (3, 3, 4)
+    assert read_levels(tmp_path / "a.npy", "left").levels.shape == (3, 3, 4)
 
 
 def test_ply_reads_back(tmp_path):

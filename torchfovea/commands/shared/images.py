@@ -12,7 +12,7 @@ from torch import Tensor
 from torchfovea.setting import SettingError, require
 from torchfovea.stereo.health import Fault, full_scale
 
-__all__ = ["Picture", "exposed", "read_picture"]
+__all__ = ["Picture", "exposed", "read_levels"]
 
 NOMINAL = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0}
 
@@ -31,7 +31,7 @@ class Picture(NamedTuple):
     turned: bool
 
 
-def read_picture(path: Path, setting: str) -> Picture:
+def read_levels(path: Path, setting: str) -> Picture:
     """An image as it is stored.
 
     Args:

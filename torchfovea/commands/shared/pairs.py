@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from torchfovea.commands.shared.cameras import cameras_of
-from torchfovea.commands.shared.images import exposed, read_picture
+from torchfovea.commands.shared.images import exposed, read_levels
 from torchfovea.commands.shared.settings import choice, is_number
 from torchfovea.commands.shared.truth import load_truth
 from torchfovea.sensing.camera import Camera, Pinhole
@@ -154,7 +154,7 @@ def gaze_of(cfg: DictConfig, pair: Pair) -> tuple[float, float] | None:
 
 def _images(left: Path, right: Path, where: str = "") -> tuple[Tensor, Tensor, tuple[Fault, ...]]:
     """Both images in [0, 1], and what is wrong with their files."""
-    one, other = (read_picture(path, f"{where}{name}") for path, name in ((left, "left"), (right, "right")))
+    one, other = (read_levels(path, f"{where}{name}") for path, name in ((left, "left"), (right, "right")))
     size, found = (f"{p.levels.shape[-1]}x{p.levels.shape[-2]} px" for p in (one, other))
     require(size == found, f"{where}right", found, f"the left image's {size}")
     *images, faults = exposed(one, other)

@@ -32,7 +32,7 @@ def load_truth(cfg: DictConfig) -> tuple[Tensor | None, Tensor | None]:
             require(OmegaConf.select(cfg, name) is None, name, OmegaConf.select(cfg, name), "null without a disparity")
         return None, None
     require(isinstance(cfg.disparity, str), "disparity", cfg.disparity, "a file's name")
-    truth, _ = load_disparity(Path(cfg.disparity), "disparity", unit, unknown)
+    truth, _ = load_disparity(Path(cfg.disparity), "disparity", unit_px=unit, unknown=unknown)
     name = OmegaConf.select(cfg, "mask")
     if name is None:
         return truth, None
