@@ -126,7 +126,7 @@ def test_every_command_is_named():
         assert set(re.findall(r"^\| `(\w+)` \|", PAGES[page], re.MULTILINE)) == set(COMMANDS), page
 
 
-@pytest.mark.parametrize("page", PAGES)
+@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md"])  # those of the site are the next test's
 def test_links_lead_somewhere(page):
     folder = (ROOT / page).parent
     text = BLOCK.sub("", PAGES[page])

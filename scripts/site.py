@@ -1,0 +1,71 @@
+"""MkDocs hooks: the first page and the changes from the repository's own files, the reference from docstrings."""
+
+import ast
+import re
+from pathlib import Path
+from typing import Any
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "torchfovea"
+OVERVIEW = "reference/index.md"
+
+
+def on_config(config: MkDocsConfig) -> None:
+    """Name the pages of docs/ that the navigation does not, and those of the reference."""
+    known = re.findall(r"[\w/-]+\.md", str(config.nav))
+    arrived = sorted(path.name for path in Path(config.docs_dir).glob("*.md") if path.name not in known)
+    for section in config.nav or []:
+        if "Guides" in section:
+            section["Guides"] += arrived
+        if "Reference" in section:
+            section["Reference"] = [OVERVIEW, *(f"reference/{name}.md" for name in rooms())]
+
+
+def on_files(files: Files, config: MkDocsConfig) -> None:
+    """Make the pages that are not written but follow."""
+    made = {"index.md": of_the_site("README.md"), "changes.md": of_the_site("CHANGELOG.md"), OVERVIEW: front_door()}
+    made |= {f"reference/{name}.md": page_of(name, modules) for name, modules in rooms().items()}
+    for uri, text in made.items():
+        files.append(File.generated(config, uri, content=text))
+
+
+def of_the_site(name: str) -> str:
+    """A page of the repository's root whose links lead into the site."""
+    text = (ROOT / name).read_text(encoding="utf-8").replace("](docs/", "](")
+    text = text.replace("](CHANGELOG.md)", "](changes.md)")
+    return re.sub(r"\[([^]]+)\]\((?:CONTRIBUTING\.md|CITATION\.cff)\)", r"\1", text)
+
+
+def rooms() -> dict[str, list[str]]:
+    """The package's folders, what stands beside them being one too, and their public modules."""
+    found: dict[str, list[str]] = {"torchfovea": []}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        module = path.relative_to(ROOT).with_suffix("").parts
+        if module[-1].startswith("_") or module[1] == "commands":
+            continue
+        room = module[1] if len(module) > 2 else "torchfovea"
+        found.setdefault(room, []).append(".".join(module))
+    return found
+
+
+def page_of(name: str, modules: list[str]) -> str:
+    """The reference of a folder."""
+    title = "torchfovea" if name == "torchfovea" else f"torchfovea.{name}"
+    return "\n\n".join([f"# {title}", *(f"::: {module}" for module in modules)])
+
+
+def front_door() -> str:
+    """What `import torchfovea` offers, each name leading to where it is documented."""
+    tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
+    names = {
+        alias.name: node.module
+        for node in tree.body
+        if isinstance(node, ast.ImportFrom) and node.module
+        for alias in node.names
+    }
+    lines: list[Any] = [f"| [`tf.{name}`][{module}.{name}] | `{module}` |" for name, module in sorted(names.items())]
+    text = (ast.get_docstring(tree) or "").replace("\n\n", " ")
+    return "\n".join(["# Reference", "", f"`import torchfovea as tf`. {text}", "", "| name | from |", "|---|---|", *lines])
