@@ -3,7 +3,6 @@
 import ast
 import re
 from pathlib import Path
-from typing import Any
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
@@ -66,6 +65,7 @@ def front_door() -> str:
         if isinstance(node, ast.ImportFrom) and node.module
         for alias in node.names
     }
-    lines: list[Any] = [f"| [`tf.{name}`][{module}.{name}] | `{module}` |" for name, module in sorted(names.items())]
+    lines = [f"| [`tf.{name}`][{module}.{name}] | `{module}` |" for name, module in sorted(names.items())]
     text = (ast.get_docstring(tree) or "").replace("\n\n", " ")
-    return "\n".join(["# Reference", "", f"`import torchfovea as tf`. {text}", "", "| name | from |", "|---|---|", *lines])
+    head = ["# Reference", "", f"`import torchfovea as tf`. {text}", "", "| name | from |", "|---|---|"]
+    return "\n".join([*head, *lines])
