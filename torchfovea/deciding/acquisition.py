@@ -159,6 +159,7 @@ def _normal_cdf(z: Tensor) -> Tensor:
 
 def _of_one_shape(mean: Tensor, std: Tensor, row: float | Tensor = 0.0, name: str = "incumbent") -> None:
     """Refuse what would broadcast to another shape than the mean's: (4, 1) with (4,) makes 16 numbers of 4."""
+    require(mean.is_floating_point(), "mean.dtype", mean.dtype, "a floating-point type")
     shapes = tuple(std.shape), tuple(mean.shape)
     require(std.dim() in (0, mean.dim()) and _fits(std, mean), "std.shape", shapes[0], f"{shapes[1]}, as the mean")
     if isinstance(row, Tensor):

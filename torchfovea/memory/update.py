@@ -22,6 +22,7 @@ from torchfovea.memory.voting import cast, see
 from torchfovea.sensing.chart import turn_cartesian
 from torchfovea.sensing.kinship import Kinship
 from torchfovea.sensing.triangulation import Observations
+from torchfovea.setting import require
 
 __all__ = ["Common", "fuse", "remember"]
 
@@ -71,10 +72,12 @@ def remember(
         which of them agree are held fixed).
 
     Raises:
-        SettingError: for observations or a fusion of another chart than the memory's.
+        SettingError: for observations or a fusion of another chart than the memory's, or of another batch.
     """
     check_chart(memory, observed.chart, "observed.chart")
     check_chart(memory, fusion.chart, "fusion.chart")
+    batch, mine = tuple(observed.mean.shape[:-2]), tuple(memory.looks.shape[:-1])
+    require(batch == mine, "observed.batch", batch, f"{mine}, the memory's")
     cells = memory.cells
     observed = _like(cells, observed)
     if fusion.half_life < math.inf:

@@ -178,7 +178,7 @@ def fixate(head: Head, point: Tensor) -> tuple[Gaze, Tensor]:
         bool (...). A point behind, too near, out of limits or not finite is unreachable, never NaN.
 
     Raises:
-        SettingError: for a point of another shape, or of whole numbers.
+        SettingError: for a point of another shape or type.
 
     Differentiable in the point where it is reachable; zero gradient where it is not.
     """
@@ -201,7 +201,7 @@ def can_fixate(head: Head, point: Tensor) -> Tensor:
     """Whether the head can fixate points (..., 3) in E, bool (...): the second result of `fixate`, without the angles.
 
     Raises:
-        SettingError: for a point of another shape, or of whole numbers.
+        SettingError: for a point of another shape or type.
     """
     return _aim(head, point.detach())[-1]
 
@@ -218,8 +218,8 @@ def _aim(head: Head, point: Tensor) -> tuple[tuple[Tensor, ...], Tensor, Tensor,
         x, y and z; √(x² + y²); √(|X|² − up²), how far before the tilt axis the gaze meets it; whether there is a gaze
         at all; whether it lies within the limits. Where there is none the numbers are 1.
     """
-    good = point.dim() >= 1 and point.shape[-1] == 3 and point.is_floating_point()
-    require(good, "point", f"{tuple(point.shape)} {point.dtype}", "a floating-point tensor (..., 3)")
+    good = point.dim() >= 1 and point.shape[-1] == 3 and point.dtype in (torch.float32, torch.float64)
+    require(good, "point", f"{tuple(point.shape)} {point.dtype}", "a tensor (..., 3) of torch.float32 or torch.float64")
     x, y, z = point.unbind(-1)
     with torch.no_grad():
         largest = torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs())
