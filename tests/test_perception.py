@@ -54,7 +54,10 @@ def configured(*overrides: str):
         return compose("search", overrides=list(overrides))
 
 
-@pytest.mark.parametrize("name", sorted(set(targets_of("acquisition", "name")) - {"external"}))
+BROUGHT = {"external", "trained"}  # are what a user brings: test_extensions, test_envs
+
+
+@pytest.mark.parametrize("name", sorted(set(targets_of("acquisition", "name")) - BROUGHT))
 def test_each_strategy_scores_a_batch_as_its_rows(name, dtype):
     cfg = configured(f"acquisition={name}")
     observer = build_observer(cfg)
