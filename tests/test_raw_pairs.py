@@ -154,6 +154,7 @@ def test_the_command_senses_a_raw_pair(room, files, capsys):
         (["calibration_lens=thin"], "calibration_lens = thin: expected one of brown_conrady"),
         (["calibration_cameras=[1]"], r"calibration_cameras = [1]: expected [left, right]"),
         (["calibration_unit_m=0"], "calibration_unit_m = 0: expected metres"),
+        (["gaze_right_px=[1,900]"], "gaze_right_px = [1, 900]: expected [column, row]"),
         (["calibration=3"], "calibration = 3: expected a file's name"),
         (["left=right.png", "right=left.png", "calibration_unit_m=-1"], "calibration_unit_m = -1"),
         (["sensor=every_pixel", "matcher=sgbm"], "sensor.layout = every_pixel: expected a retina"),

@@ -99,6 +99,20 @@ def test_own_files_with_truth(folder, capsys, plane, sensor):
     assert result["median_error_m"] < 0.02
 
 
+def test_eyes_may_look_at_different_pixels(folder, capsys, plane):
+    """The plane is 12 px further left in the right image; the truth is judged all the same."""
+    files = [
+        *plane,
+        "disparity=truth.pfm",
+        "gaze_px=[120,80]",
+        "gaze_right_px=[108,80]",
+        "sensor.receptive_fields=4000",
+    ]
+    run, result = sense(capsys, *files)
+    assert result["valid_fraction"] > 0.6 and result["median_error_m"] < 0.02
+    assert np.median(points_of(run)["mean_m"][:, 2]) == pytest.approx(1.5, rel=0.01)
+
+
 def test_offset_axes_are_the_same_geometry(folder, capsys, plane):
     run, _ = sense(capsys, *plane, "doffs_px=6", "sensor=every_pixel", "matcher=sgbm")
     depth = np.median(points_of(run)["mean_m"][:, 2])

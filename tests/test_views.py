@@ -108,7 +108,27 @@ def test_eyes_and_their_cameras_in_image_pixels_are_the_same(camera):
     told = posed_views(left, right, eyes.camera_left, eyes.camera_right, rig)
     assert eyes[2:] == told[2:] and eyes.gaze_px == (29.5, 29.5)
     for one, other in zip(match_sgbm(eyes, retina)[0], match_sgbm(told, retina)[0], strict=True):
-        assert torch.equal(one, other)
+        assert one is other is None or torch.equal(one, other)
+
+
+@pytest.mark.parametrize("params", [SGBM(), Sweep()], ids=["sgbm", "sweep"])
+def test_eyes_that_look_at_one_thing_see_it_sharply(params):
+    """With the right retina where the right eye sees what the left one fixates, no fovea looks at a periphery."""
+    straight, rotation, shift = calibrated((95.0, 60.0))
+    ray = straight.camera_left.rays(torch.tensor([95.0, 60.0], dtype=torch.float64))
+    met = straight.camera_right.project((ray * (AWAY / (ray @ NORMAL)) - shift) @ rotation)
+    views = posed_views(*straight[:5], straight.gaze_px, tuple(met.tolist()))
+    assert views.gazes_px == ((95.0, 60.0), tuple(met.tolist())) and views.whole().span_px >= straight.whole().span_px
+    scores, away = [], straight._replace(gaze_right_px=(50.0, 100.0))
+    for pair in (away, views):
+        place, seen = truth(pair, rotation, shift, LogPolar(3000))
+        matches, _ = Matcher(params, 0.5)(pair, LogPolar(3000), Budget())
+        both = matches.valid & seen & (matches.left_px.norm(dim=-1) < 20)
+        scores.append((matches.right_px - place)[both].norm(dim=-1).median())
+    assert both.sum() > 0.9 * (seen & (matches.left_px.norm(dim=-1) < 20)).sum()
+    assert scores[1] < 0.1 / views.scale(RETINA) and scores[1] < 0.5 * scores[0]
+    middle = views.cameras(RETINA)[1].project((ray * (AWAY / (ray @ NORMAL)) - shift) @ rotation)
+    assert middle.abs().max() < 1e-9
 
 
 # ---------------------------------------------------------------------------------------------------- what it tells

@@ -45,7 +45,8 @@ class Eye(NamedTuple):
         others: of the other eye's.
         retina: of both.
         scale: image pixels per retinal pixel.
-        middle: image pixel of the optical axis, column and row.
+        middle: image pixel that its retina looks at, column and row.
+        other_middle: the other eye's, in its image; None: the same.
     """
 
     camera: Camera
@@ -58,6 +59,7 @@ class Eye(NamedTuple):
     retina: Retina
     scale: float
     middle: tuple[float, float]
+    other_middle: tuple[float, float] | None = None
 
 
 class Looks(NamedTuple):
@@ -86,14 +88,17 @@ def left_eye(pair: Tensor, views: Views, retina: Retina) -> Eye:
         views: their cameras, and how these stand.
         retina: of both.
     """
-    scale, middle, rig = views.scale(retina), views.gaze_px, views.rig
-    levels = acuity(pair, retina, scale, middle)
+    scale, (middle, there), rig = views.scale(retina), views.gazes_px, views.rig
     batch = len(pair) // 2
+    if there == middle:
+        levels = acuity(pair, retina, scale, middle)
+    else:
+        levels = torch.cat([acuity(pair[:batch], retina, scale, middle), acuity(pair[batch:], retina, scale, there)])
     R_left, R_right = (r.to(pair).expand(batch, 3, 3) for r in (rig.R_left, rig.R_right))
     shift = -(R_right.mT @ pair.new_tensor([rig.baseline_m, 0.0, 0.0]))
     camera, other = views.cameras(retina)
     mine, theirs = levels[:batch], levels[batch:]
-    return Eye(camera, other, R_right.mT @ R_left, shift, R_left[:, 2], mine, theirs, retina, scale, middle)
+    return Eye(camera, other, R_right.mT @ R_left, shift, R_left[:, 2], mine, theirs, retina, scale, middle, there)
 
 
 def acuity(images: Tensor, retina: Retina, scale: float, middle: tuple[float, float]) -> Tensor:
@@ -203,14 +208,15 @@ def project(eye: Eye, ray: Tensor, rho: Tensor) -> tuple[Tensor, Tensor, Tensor]
     return u, v, ahead & (u.detach().square() + v.detach().square() <= eye.retina.radius_px**2)
 
 
-def _read(eye: Eye, images: Tensor, u: Tensor, v: Tensor, width_px: Tensor) -> Tensor:
+def _read(eye: Eye, other: bool, u: Tensor, v: Tensor, width_px: Tensor) -> Tensor:
     """Averages as wide as RFs of `width_px` (R, S), or wider where the retina is coarser, at places (B, D, R, S)."""
+    images, middle = (eye.others, eye.other_middle or eye.middle) if other else (eye.images, eye.middle)
     height, width = images.shape[-2:]
     level = _level(width_px, eye.scale).clamp(max=images.shape[1] - 1)
     low, high = int(level.min()), math.ceil(float(level.max()))
     across, down = 2 / max(width - 1, 1), 2 / max(height - 1, 1)
     grid = torch.stack(
-        [u * (eye.scale * across) + (eye.middle[0] * across - 1), v * (eye.scale * down) + (eye.middle[1] * down - 1)],
+        [u * (eye.scale * across) + (middle[0] * across - 1), v * (eye.scale * down) + (middle[1] * down - 1)],
         -1,
     )
     value: Tensor = F.grid_sample(
@@ -227,14 +233,14 @@ def _read(eye: Eye, images: Tensor, u: Tensor, v: Tensor, width_px: Tensor) -> T
 def own_values(eye: Eye, sheet: Sheet, radius: int, noise: float) -> Looks:
     """What a sheet's cells see in their own eye."""
     u, v = (c.expand(len(eye.images), 1, -1, -1) for c in sheet.px.unbind(-1))
-    values = _read(eye, eye.images, u, v, sheet.width_px)
+    values = _read(eye, False, u, v, sheet.width_px)
     return Looks(values, *_moments(values, sheet, radius, noise))
 
 
 def read_other(eye: Eye, sheet: Sheet, ray: Tensor, rho: Tensor) -> Tensor:
     """What the other eye sees of points on the rays of a sheet's cells, (B, D, R, S); see `project`."""
     u, v, _ = project(eye, ray, rho)
-    return _read(eye, eye.others, u, v, sheet.width_px)
+    return _read(eye, True, u, v, sheet.width_px)
 
 
 def read_own(eye: Eye, sheet: Sheet, ray: Tensor, step: Tensor) -> Tensor:
@@ -248,7 +254,7 @@ def read_own(eye: Eye, sheet: Sheet, ray: Tensor, step: Tensor) -> Tensor:
     u, v = eye.camera.project(beside).unbind(-1)
     own_u, own_v = (c.expand(len(ray), 1, -1, -1) for c in sheet.px.unbind(-1))
     u, v = (torch.cat([b[:, :1], own, b[:, 1:]], 1) for b, own in ((u, own_u), (v, own_v)))
-    return _read(eye, eye.images, u, v, sheet.width_px)
+    return _read(eye, False, u, v, sheet.width_px)
 
 
 def _moments(values: Tensor, sheet: Sheet, radius: int, noise: float) -> tuple[Tensor, Tensor]:
@@ -274,7 +280,7 @@ def correlate(
         (B, D, R, S) and bool, whether the other eye sees the cell itself.
     """
     u, v, seen = project(eye, ray, rho)
-    values = _read(eye, eye.others, u, v, sheet.width_px)
+    values = _read(eye, True, u, v, sheet.width_px)
     mean, variance = _moments(values, sheet, radius, noise)
     cov = average(own.values * values, radius, sheet.closed) - own.mean * mean
     return cov * (own.variance * variance).rsqrt(), seen

@@ -65,7 +65,7 @@ class RectifiedPair(NamedTuple):
             place, camera = self.place(px)[0], views.cameras(retina)[1]
             rays = self.camera.rays(columns(place[..., 0] - shift_px, place[..., 1])) @ views.rig.R_right.to(px)
             there = camera.project(rays)
-            seen = camera.in_view(rays) & views.holds(there, retina)
+            seen = camera.in_view(rays) & views.holds(there, retina, right=True)
         return there, seen if retina is None else seen & retina.inside(there)
 
     def seen(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:

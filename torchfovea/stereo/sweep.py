@@ -126,7 +126,7 @@ def match_sweep(
     sigma = torch.where(valid, variance, torch.ones_like(variance)).sqrt()
     u, v, seen = project(eye, ray, torch.stack([rho - sigma, rho, rho + sigma], 1))
     right_px = columns(u[:, 1], v[:, 1])
-    valid = valid & seen[:, 1] & views.holds(right_px.detach(), retina)
+    valid = valid & seen[:, 1] & views.holds(right_px.detach(), retina, right=True)
     slack = unit.detach()  # noise may carry a match past the last hypothesis
     valid = valid & (rho.detach() >= low - slack) & (rho.detach() <= high + slack)
     square = ((u[:, 2] - u[:, 0]).square() + (v[:, 2] - v[:, 0]).square()) / 4

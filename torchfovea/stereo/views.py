@@ -32,10 +32,11 @@ class Views(NamedTuple):
         camera_left: in image pixels.
         camera_right: in image pixels.
         rig: how the cameras stand; its rotations may be a batch (B, 3, 3), too.
-        gaze_px: image pixel (column, row) that the retinas look at, in both images.
+        gaze_px: image pixel (column, row) that the retinas look at, in both images, or in the left one.
         rectified: whether the images are rectified views as they are: no rotation, and pinholes that differ in cx
             alone, so that matchers need not resample them.
         span_px: side of the square about the gaze that the retinas span; None: the images' shorter side.
+        gaze_right_px: the right image's pixel that its retina looks at, where it is another one; else None.
     """
 
     left: Tensor
@@ -46,6 +47,12 @@ class Views(NamedTuple):
     gaze_px: tuple[float, float]
     rectified: bool = False
     span_px: int | None = None
+    gaze_right_px: tuple[float, float] | None = None
+
+    @property
+    def gazes_px(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """What the left and the right retina look at, each in its image."""
+        return self.gaze_px, self.gaze_px if self.gaze_right_px is None else self.gaze_right_px
 
     @property
     def source_px(self) -> int:
@@ -55,8 +62,7 @@ class Views(NamedTuple):
     def whole(self) -> Views:
         """The same, with retinas that span all of the images, whatever pixel they look at."""
         height, width = self.left.shape[-2:]
-        (u, v) = self.gaze_px
-        reach = math.hypot(max(u, width - 1 - u) + 0.5, max(v, height - 1 - v) + 0.5)
+        reach = max(math.hypot(max(u, width - 1 - u) + 0.5, max(v, height - 1 - v) + 0.5) for u, v in self.gazes_px)
         return self._replace(span_px=math.ceil(2 * reach))
 
     @property
@@ -68,19 +74,22 @@ class Views(NamedTuple):
         """Image pixels per retinal pixel; 1 without a retina, whose receptive fields (RFs) are the pixels then."""
         return 1.0 if retina is None else self.source_px / (2 * retina.radius_px)
 
-    def origin_px(self, retina: Retina | None) -> tuple[float, float]:
+    def origin_px(self, retina: Retina | None, right: bool = False) -> tuple[float, float]:
         """The image pixel where retinal coordinates are 0: the gaze; without a retina the first pixel."""
-        return (0.0, 0.0) if retina is None else self.gaze_px
+        return (0.0, 0.0) if retina is None else self.gazes_px[right]
 
     def cameras(self, retina: Retina | None) -> tuple[Camera, Camera]:
         """Both cameras in retinal pixels, those of the correspondences."""
-        scale, (u, v) = self.scale(retina), self.origin_px(retina)
-        shift = (-u / scale, -v / scale)
-        return self.camera_left.scaled(1 / scale, shift), self.camera_right.scaled(1 / scale, shift)
+        scale = self.scale(retina)
+        (u, v), (s, t) = (self.origin_px(retina, right) for right in (False, True))
+        return (
+            self.camera_left.scaled(1 / scale, (-u / scale, -v / scale)),
+            self.camera_right.scaled(1 / scale, (-s / scale, -t / scale)),
+        )
 
-    def holds(self, px: Tensor, retina: Retina | None, slack_px: float = 0.0) -> Tensor:
-        """Whether places (..., 2) [retinal px] lie on the images, or so many image pixels beyond; bool (...)."""
-        place = px * self.scale(retina) + px.new_tensor(self.origin_px(retina))
+    def holds(self, px: Tensor, retina: Retina | None, slack_px: float = 0.0, right: bool = False) -> Tensor:
+        """Whether places (..., 2) [retinal px] lie on an image, or so many image pixels beyond; bool (...)."""
+        place = px * self.scale(retina) + px.new_tensor(self.origin_px(retina, right))
         height, width = self.left.shape[-2:]
         low, high = -0.5 - slack_px, place.new_tensor([width - 0.5 + slack_px, height - 0.5 + slack_px])
         return ((place >= low) & (place <= high)).all(-1)
@@ -100,7 +109,12 @@ class Views(NamedTuple):
         return torch.stack([image.expand(3, -1, -1) for image in (self.left, self.right)])
 
     def fovea(self, images: Tensor, retina: Retina) -> Tensor:
-        """What the retina sees of images (B, C, H, W) of this size, (B, C, N). Differentiable."""
+        """What retinas see of images (B, C, H, W) of this size, (B, C, N): both eyes', or B of the left eye.
+
+        Differentiable.
+        """
+        if self.gaze_right_px is not None and len(images) == 2:
+            return fovea(images, images.new_tensor(self.gazes_px), retina, self.scale(retina))
         gaze = None if self.gaze_px == _middle(images) else images.new_tensor([self.gaze_px] * len(images))
         return fovea(images, gaze, retina, self.scale(retina))
 
@@ -182,6 +196,7 @@ def posed_views(
     camera_right: Camera,
     rig: StereoRig,
     gaze_px: tuple[float, float] | None = None,
+    gaze_right_px: tuple[float, float] | None = None,
 ) -> Views:
     """The images of any calibrated pair.
 
@@ -191,7 +206,8 @@ def posed_views(
         camera_left: in image pixels.
         camera_right: in image pixels.
         rig: how they stand (`torchfovea.stereo.rig.posed`).
-        gaze_px: (column, row) that the retinas look at in both; None for the images' middle.
+        gaze_px: (column, row) that the retinas look at; None for the images' middle.
+        gaze_right_px: the right one's, if it is another: eyes that meet at something near see both of it sharply.
 
     Raises:
         SettingError: as `verged_views`.
@@ -200,9 +216,13 @@ def posed_views(
     _check_camera("camera_left", camera_left)
     _check_camera("camera_right", camera_right)
     _check_rig(rig, images[0])
-    u, v = _middle(images[0]) if gaze_px is None else gaze_px
-    require(math.isfinite(u) and math.isfinite(v), "gaze_px", gaze_px, "finite pixels")
-    return Views(*images, camera_left, camera_right, rig, (float(u), float(v)))
+    gazes = []
+    for name, given in (("gaze_px", gaze_px), ("gaze_right_px", gaze_right_px)):
+        u, v = _middle(images[0]) if given is None else given
+        require(math.isfinite(u) and math.isfinite(v), name, given, "finite pixels")
+        gazes.append((float(u), float(v)))
+    other = None if gaze_right_px is None or gazes[0] == gazes[1] else gazes[1]
+    return Views(*images, camera_left, camera_right, rig, gazes[0], gaze_right_px=other)
 
 
 def _images(left: Tensor | np.ndarray, right: Tensor | np.ndarray) -> tuple[Tensor, Tensor]:

@@ -71,7 +71,8 @@ def run(cfg: DictConfig) -> float | None:
     match, pair, health = build_match(cfg), load_pair(cfg), health_of(cfg)
     raw = retina is None and pair.rig is not None
     require(not raw, "sensor.layout", "every_pixel", "a retina (sensor=log_polar or uniform) for raw images")
-    views, budget = pair.views(gaze_of(cfg, pair)), build_budget(cfg, pair=True)
+    gazes = [gaze_of(cfg, pair, name) for name in ("gaze_px", "gaze_right_px")]
+    views, budget = pair.views(*gazes), build_budget(cfg, pair=True)
     views = views.whole() if choice(cfg, "span", ("whole", "shorter")) == "whole" else views
     printed = choice(cfg, "budget.sigma_points", ("ours", "paper")) == "paper"
     found_out = examine(pair, views, health)
@@ -84,6 +85,8 @@ def run(cfg: DictConfig) -> float | None:
         told += examine_map(found.disparity, found.valid, found_out.matches, views, health)
     sensed = sense(views, retina, matches, SigmaPoints.paper() if printed else None, not printed)
     _write(folder, sensed, views, retina)
+    # the truth is the left image's, wherever the right eye looked
+    views = views._replace(rectified=pair.rig is None, gaze_right_px=None)
     # from here on nothing can lose the points
     observed, points = sensed.observed, sensed.points
     figures: dict[str, float] = {"image_seen": image_seen(views, retina), "rows_px": found_out.rows_px}

@@ -52,11 +52,13 @@ class Pair(NamedTuple):
     seen: Tensor | None = None
     faults: tuple[Fault, ...] = ()
 
-    def views(self, gaze_px: tuple[float, float] | None) -> Views:
+    def views(self, gaze_px: tuple[float, float] | None, gaze_right_px: tuple[float, float] | None = None) -> Views:
         """What a matcher is given of it, with retinas that look at a pixel (column, row), or at the middle."""
         left, right = self.camera_left, self.camera_right
-        if self.rig is not None:
-            return posed_views(self.left, self.right, left, right, self.rig, gaze_px)
+        if self.rig is not None or gaze_right_px is not None:
+            eye = torch.eye(3, dtype=torch.float64)
+            rig = StereoRig(eye, eye, self.baseline_m) if self.rig is None else self.rig
+            return posed_views(self.left, self.right, left, right, rig, gaze_px, gaze_right_px)
         assert isinstance(left, Pinhole) and isinstance(right, Pinhole)
         return rectified_views(self.left, self.right, left, right, self.baseline_m, gaze_px)
 
@@ -134,21 +136,21 @@ def motorcycle() -> Pair:
     return Pair(left, right, Pinhole(focal, cx, cy), Pinhole(focal, cx + doffs, cy), 0.193001, truth)
 
 
-def gaze_of(cfg: DictConfig, pair: Pair) -> tuple[float, float] | None:
-    """Where the retinas look, (column, row); None for the images' middle.
+def gaze_of(cfg: DictConfig, pair: Pair, name: str = "gaze_px") -> tuple[float, float] | None:
+    """Where the retinas look, (column, row), by the setting of this name; None for what is not told.
 
     Raises:
         SettingError: for anything but a pixel of the images.
     """
-    given = cfg.gaze_px
+    given = cfg[name]
     if given is None:
         return None
     height, width = pair.left.shape[-2:]
     expected = f"[column, row], a pixel of the {width}x{height} images"
     two = OmegaConf.is_list(given) and len(given) == 2 and all(is_number(v) for v in given)
-    require(two, "gaze_px", given, expected)
+    require(two, name, given, expected)
     column, row = (float(v) for v in given)
-    require(0 <= column <= width - 1 and 0 <= row <= height - 1, "gaze_px", given, expected)
+    require(0 <= column <= width - 1 and 0 <= row <= height - 1, name, given, expected)
     return column, row
 
 
