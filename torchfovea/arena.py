@@ -84,3 +84,7 @@ class Arenas:
     def fixation(self, gaze: Gaze) -> Fixation:
         """The truth at each gaze."""
         return Fixation(*stack([arena.fixation(one) for arena, one in self._each(gaze)]))
+
+    def truths(self, cells: Tensor) -> list[Truth]:
+        """What the judge knows as each robot stands now, of cells (B, Nx, 3); for arenas that move and can tell."""
+        return [arena.truth(one) for arena, one in zip(self.arenas, cells, strict=True)]  # type: ignore[attr-defined]

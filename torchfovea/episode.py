@@ -37,8 +37,8 @@ class Episode(NamedTuple):
         range_m: true range at the fixation.
         aimed_m: range of the point that both eyes turned to.
         reward: −range; floor, a miss or what is not of the class that is sought −far_m.
-        gap: Eq. 46.
-        regret: Eq. 50.
+        gap: Eq. 46; of a base that moves, r* is the best reward that was within reach anywhere on its way.
+        regret: Eq. 50; of a base that moves, r* is that of the moment.
         global_information: Eq. 52 [nats].
         local_information: Eq. 54 [nats]; None where no cell lies near the nearest point.
         hit: bool, whether the fixation is on the target.
@@ -144,7 +144,7 @@ def run_episodes(
         observer: the fixed parts, alike for all.
         memory: B memories, see `torchfovea.arena.stack`.
         arena: of B robots, see `torchfovea.arena.Arenas`.
-        truths: for the metrics only, B.
+        truths: for the metrics only, B; of bases that move at the start, `Arenas.truths` tells the others.
         generators: one for each episode; the same seed gives the same episode, whatever the batch.
         rules: how long, by which strategy, and what counts.
         each: called after every decision with t (from 0), the looks and the steps.
@@ -155,14 +155,21 @@ def run_episodes(
     saccades, far_m = rules.saccades, rules.far_m
     for truth in truths:
         require(0 < truth.nearest_m < far_m, "far_m", far_m, f"more than the nearest range, {truth.nearest_m:.3f} m")
-    close = [near_target(t.cell_points, t.nearest_point, rules.near_target_m) for t in truths]
-    near = torch.stack(close).to(memory.cells.device)
+    near, best_m = _near(truths, memory, rules), _best(truths, far_m)
+    bests: list[Tensor] = []
+    known = torch.ones(len(truths), dtype=torch.bool)
     moves: list[Move] = []
     fixations: list[Fixation] = []
     gathered: list[Tensor] = []
     local: list[Tensor] = []
     looks, compute = torch.zeros(len(truths), device=memory.cells.device), 0.0
     for t, glance in enumerate(search(arena, observer, memory, saccades, generators, rules.strategy, rules.stop)):
+        if glance.move.base is not None:
+            require(hasattr(arena, "truths"), "arena", type(arena).__name__, "one with truths(cells): its base moves")
+            truths = arena.truths(memory.cells)  # type: ignore[attr-defined]
+            near, best_m = _near(truths, memory, rules), _best(truths, far_m)
+        known &= near.any(-1).cpu()
+        bests.append(best_m)
         moves.append(glance.move)
         fixations.append(arena.fixation(glance.move.gaze))
         if glance.look is None:
@@ -177,6 +184,7 @@ def run_episodes(
     still = moves[-1]._replace(seconds=0 * moves[-1].seconds, degrees=0 * moves[-1].degrees)
     moves += [still] * (saccades - len(moves))
     fixations += fixations[-1:] * (saccades - len(fixations))
+    bests += bests[-1:] * (saccades - len(bests))
     gathered, local = (course + course[-1:] * (saccades - len(course)) for course in (gathered, local))
 
     def over_time(parts: Sequence[Any]) -> Tensor:
@@ -192,10 +200,12 @@ def run_episodes(
     aimed = gaze_point(observer.head, Gaze(*gazes)).norm(dim=-1)
     informed = over_time(gathered).double()
     locally = over_time(local).double()
+    best_now = over_time(bests)
+    moved = bool((best_now != best_now[:, :1]).any())
     far_travelled, took = (over_time([m[k] for m in moves]).double().sum(-1) for k in (2, 1))
     episodes = []
     for b, truth in enumerate(truths):
-        best = torch.tensor(-truth.nearest_m, dtype=torch.float64)
+        best = best_now[b].max()
         own = row(step._replace(state=None), b)
         episodes.append(
             Episode(
@@ -205,9 +215,9 @@ def run_episodes(
                 aimed_m=aimed[b],
                 reward=reward[b],
                 gap=gap(reward[b], best),
-                regret=regret(reward[b], best),
+                regret=regret(reward[b] - best_now[b], 0 * best) if moved else regret(reward[b], best),
                 global_information=informed[b],
-                local_information=locally[b] if bool(near[b].any()) else None,
+                local_information=locally[b] if bool(known[b]) else None,
                 hit=hit[b],
                 moves=int(saccades_to_target(hit[b])),
                 target_error_m=_target_error(own, truth),
@@ -220,6 +230,17 @@ def run_episodes(
             )
         )
     return episodes
+
+
+def _near(truths: Sequence[Truth], memory: Memory, rules: Rules) -> Tensor:
+    """Which cells' true points are near the nearest one, (B, Nx)."""
+    close = [near_target(t.cell_points, t.nearest_point, rules.near_target_m) for t in truths]
+    return torch.stack(close).to(memory.cells.device)
+
+
+def _best(truths: Sequence[Truth], far_m: float) -> Tensor:
+    """The best reward within reach, (B,)."""
+    return -torch.tensor([min(truth.nearest_m, far_m) for truth in truths], dtype=torch.float64)
 
 
 def _target_error(step: Step, truth: Truth) -> float | None:

@@ -21,10 +21,10 @@ from torchfovea.memory.moving import move as move_memory
 from torchfovea.perception import Observer, Step, check_owner, decide, gaze_at, perceive
 from torchfovea.rows import row, stack
 from torchfovea.sensing.correspondence import Correspondences
-from torchfovea.sensing.head import Eyes, Gaze, Head, eyes, fixate
+from torchfovea.sensing.head import Eyes, Gaze, Head, eyes, fixate, gaze_point
 from torchfovea.setting import require
 
-__all__ = ["Glance", "Look", "Move", "Robot", "StopRule", "search", "seen_from"]
+__all__ = ["Glance", "Look", "Move", "Robot", "StopRule", "search", "seen_from", "steadied"]
 
 StopRule = tuple[float, float]
 """(tolerance, probability) of `torchfovea.deciding.acquisition.known_well_enough`."""
@@ -187,6 +187,20 @@ def seen_from(head: Head, gaze: Gaze, base: Motion | None = None) -> Eyes:
     turn, shift = base.rotation.to(pose.t_left), base.translation.to(pose.t_left)
     left, right = ((t - shift) @ turn for t in (pose.t_left, pose.t_right))
     return Eyes(turn.mT @ pose.R_left, left, turn.mT @ pose.R_right, right)
+
+
+def steadied(head: Head, gaze: Gaze, base: Motion) -> Gaze:
+    """The gaze that meets the same point after the base has moved, as near as the head can turn to it.
+
+    Args:
+        head: of the robot.
+        gaze: before (...).
+        base: how the base moved.
+    """
+    parallel = 1e-6  # eyes that do not converge look at the horizon
+    point = gaze_point(head, gaze._replace(vergence=gaze.vergence.clamp(min=parallel)))
+    turn, shift = base.rotation.to(point), base.translation.to(point)
+    return fixate(head, (point - shift) @ turn)[0]
 
 
 def _carried(observer: Observer, memory: Memory, base: Motion) -> Memory:

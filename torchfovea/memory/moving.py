@@ -38,6 +38,9 @@ from torchfovea.setting import require
 __all__ = ["Motion", "motion", "move", "resample"]
 
 
+EDGE_ON = 4.0  # a slope so many times less certain than an unseen cell's is of a patch that is seen from its edge
+
+
 class Motion(NamedTuple):
     """A step of the base as odometry tells it; build it with `motion`, which checks it.
 
@@ -116,7 +119,7 @@ class _Moved(NamedTuple):
 
 
 def _carry(memory: Memory, step: Motion) -> _Moved:
-    """Move what was seen; patches whose back the robot would see now are dropped. Float64: planes mix scales."""
+    """Move what was seen but patches whose back or edge the robot would see now. Float64: planes mix scales."""
     information = Information(*(part.double() for part in memory.information))
     moments = gaussian_from_information(information)
     rotation = step.rotation.mT.to(memory.cells.device)
@@ -152,6 +155,10 @@ def _carry(memory: Memory, step: Motion) -> _Moved:
         turned = torch.cat([-_skew(q), -q[..., :, None] * q[..., None, :]], -1)
         drift = pack(turned @ noise @ turned.mT)
     state = Gaussian(state.mean, state.cov + drift)
+    if chart == "inverse_range":
+        # nearly edge-on the slope blows up beyond what planes can have, and nothing is left of it in float32
+        wild = state.cov[..., 0] + state.cov[..., 3] + state.cov[..., 5] - quadratic3(state.cov, direction)
+        facing = facing & (wild < 2 * (EDGE_ON * memory.prior.slope_std) ** 2)
     good = facing & (square > 1e-6) & torch.isfinite(state.cov).all(-1) & torch.isfinite(state.mean).all(-1)
     lasting = memory.lasting[seen].double() * columns(cov[..., 5].sqrt(), cov[..., 5])
     rows = (part[good] for part in (direction, bearing, looks, lasting, memory.votes[seen]))

@@ -10,16 +10,18 @@ from torch import Tensor
 
 from torchfovea.arena import Fixation, Truth
 from torchfovea.looking import Pictures, look_at
+from torchfovea.memory.moving import Motion
 from torchfovea.perception import Observer
 from torchfovea.recordings.folder import Recorder
 from torchfovea.recordings.frames import Calibration
 from torchfovea.recordings.pictures import as_kept
-from torchfovea.search import Look, Move
+from torchfovea.search import Look, Move, steadied
 from torchfovea.sensing.fields import draw_fields, for_all
 from torchfovea.sensing.geometric import correspond_points, with_noise
 from torchfovea.sensing.head import Gaze, eyes
 from torchfovea.setting import require
 from torchfovea.sim.truth import truth_of
+from torchfovea.sim.walk import Route
 from torchfovea.sim.world import World
 from torchfovea.stereo.matchers import Match
 from torchfovea.stereo.rig import verged
@@ -36,7 +38,9 @@ class SimulatedArena:
         observer: whose retina and error budget the sensor has.
         matcher: matches the images; None: the geometric sensor.
         sample: how many receptive fields a look goes through, drawn anew each time; None: all of them.
-        seed: of the encoders' noise, where the observer's head has any: it then believes them, and the world does not.
+        seed: of the encoders' noise, where the observer's head has any (it then believes them, and the world does
+            not), and of the odometry's.
+        route: where the base goes, a step before each saccade but the first; None: nowhere.
     """
 
     def __init__(
@@ -46,11 +50,16 @@ class SimulatedArena:
         matcher: Match | None,
         sample: int | None = None,
         seed: int = 0,
+        route: Route | None = None,
     ) -> None:
         self.world, self.observer, self.matcher, self.sample = world, observer, matcher, sample
         self.noise = torch.Generator().manual_seed(seed)
         self.recorder: Recorder | None = None
-        self.seconds = 0.0
+        self.seconds, self.route = 0.0, route
+        self.base: Motion | None = None  # of the last saccade
+        self._steps = -1
+        if route is not None:
+            world.stand(route.pose(0))
 
     def record(self, folder: str | os.PathLike[str]) -> None:
         """From now on keep what the eyes see, in a new recording; and the eyes see what it keeps.
@@ -65,12 +74,30 @@ class SimulatedArena:
         self.recorder = Recorder(folder, Calibration(camera, camera, (side, side), self.observer.head, True))
 
     def saccade(self, gaze: Gaze) -> Move:
-        """Move the head and wait until it rests; the gaze that comes back is what the encoders tell."""
+        """Move the base and the head and wait until they rest; what comes back is what odometry and encoders tell.
+
+        While the base moves, the head keeps its gaze on the point that it was sent to, as the vestibulo-ocular reflex
+        does.
+        """
+        self.base = self._walk()
+        if self.base is not None:
+            gaze = steadied(self.observer.head, gaze, self.base)
         moved = self.world.saccade(gaze)
         self.seconds += moved.seconds
         sigma = math.radians(self.observer.head.encoder_deg)
         error = sigma * torch.randn(3, generator=self.noise, dtype=torch.float64)
-        return Move(Gaze(*(a + e for a, e in zip(moved.gaze, error, strict=True))), *moved[1:])
+        return Move(Gaze(*(a + e for a, e in zip(moved.gaze, error, strict=True))), *moved[1:], self.base)
+
+    def _walk(self) -> Motion | None:
+        """Go a step along the route; what odometry tells of it, or None for no step."""
+        self._steps += 1
+        if self.route is None or self._steps == 0:
+            return None
+        before, after = self.route.pose(self._steps - 1), self.route.pose(self._steps)
+        if before == after:
+            return None
+        self.world.stand(after)
+        return self.route.odometry.tell(before, after, self.noise)
 
     def _true(self, gaze: Gaze) -> Gaze:
         """Where the head really looks; with exact encoders wherever one asks."""
@@ -91,7 +118,7 @@ class SimulatedArena:
             left, right = (frame.image for frame in self.world.images(gaze))
             if self.recorder is not None:
                 left, right = as_kept(left), as_kept(right)
-                self.recorder.write(self.seconds, left, right, believed)
+                self.recorder.write(self.seconds, left, right, believed, self.base)
             return self.match(left, right, believed, generator)
         left_px = observer.retina.centers_px(dtype=gaze.pan.dtype)
         chosen = draw_fields(observer.retina.count, self.sample, generator)
@@ -114,5 +141,5 @@ class SimulatedArena:
         return look_at(self.observer, views, self.matcher, generator, self.sample)
 
     def truth(self, cells: Tensor) -> Truth:
-        """What the judge knows: the nearest point, and the surface behind every memory cell (Nx, 3)."""
+        """What the judge knows as the robot stands now: the nearest point, and the surface behind each cell (Nx, 3)."""
         return truth_of(self.world.scene, cells)

@@ -61,7 +61,7 @@ class Route:
         odometry: what is told.
     """
 
-    waypoints: Sequence[Sequence[float]] = ((0.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.3, -0.5, 0.0))
+    waypoints: Sequence[Sequence[float]] = ((0.0, 0.0, 0.0), (0.0, 0.4, 0.0), (0.0, -0.4, 0.0))
     step_m: float = 0.1
     odometry: Odometry = Odometry()
 

@@ -10,8 +10,9 @@ from torch import Tensor
 from torchfovea.sensing.camera import Camera, Pinhole, image_camera
 from torchfovea.sensing.head import Gaze, Head, clamp_gaze, cyclopean, eyes, to_ego
 from torchfovea.setting import require
+from torchfovea.sim.compile import stand_at
 from torchfovea.sim.gl import opengl
-from torchfovea.sim.model import Scene
+from torchfovea.sim.model import EgoPose, Scene
 from torchfovea.sim.motor import InstantMotor, Motor, Moved
 from torchfovea.sim.rays import Frame, RayHits, Renderer, cast, render
 from torchfovea.sim.servo import ServoMotor
@@ -53,7 +54,7 @@ class Seen(NamedTuple):
 
 
 class World:
-    """A scene with a head in it. Keeps one thing only: where the head looks.
+    """A scene with a head in it. Keeps two things only: where the head looks, and where the robot stands.
 
     Args:
         scene: from `torchfovea.sim.scene.build_scene`; its head is this world's.
@@ -106,6 +107,10 @@ class World:
         """Look straight ahead, in no time."""
         zero = torch.zeros((), dtype=torch.float64)
         self.gaze = Gaze(zero, zero, zero)
+
+    def stand(self, pose: EgoPose) -> None:
+        """Put the robot somewhere else in the world, in no time; the scene's truth is found anew."""
+        self.scene = stand_at(self.scene, pose)
 
     def saccade(self, gaze: Gaze) -> Moved:
         """Turn to a gaze, clamped to the head's limits; the executed gaze is `Moved.gaze` and this world's `gaze`.

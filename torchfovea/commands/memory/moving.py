@@ -12,18 +12,18 @@ from torch import Tensor
 from torchfovea.commands.memory.study import COLUMNS, Rows, estimate, figures_of, fixation_course, judge_cells
 from torchfovea.commands.shared.build import build_arena, build_cells, build_observer, number, whole
 from torchfovea.memory.egosphere import Memory
-from torchfovea.memory.moving import Motion, motion, move, resample
+from torchfovea.memory.moving import move, resample
 from torchfovea.metrics import gap
 from torchfovea.perception import Observer, decide, new_memory, perceive
 from torchfovea.sensing.head import Gaze, eyes, fixate
 from torchfovea.sim.arena import SimulatedArena
-from torchfovea.sim.scene import EgoPose, stand_at
-from torchfovea.sim.world import World
+from torchfovea.sim.model import EgoPose
+from torchfovea.sim.walk import Odometry
 
 __all__ = ["study_moving", "study_resampling"]
 
 FIRST_LOOKS = 5  # before the first move, or before the cells are drawn anew
-ODOMETRY_M, ODOMETRY_RAD = 0.005, math.radians(0.3)  # a step's errors along x and y, and of the turn
+ODOMETRY = Odometry()
 
 
 def _look(observer: Observer, memory: Memory, arena: SimulatedArena, gaze: Gaze, generator: torch.Generator) -> Memory:
@@ -31,27 +31,12 @@ def _look(observer: Observer, memory: Memory, arena: SimulatedArena, gaze: Gaze,
     return perceive(observer, memory, arena.look(told, generator).matches, eyes(observer.head, told))
 
 
-def _yaw(angle: float) -> Tensor:
-    c, s = math.cos(angle), math.sin(angle)
-    return torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-
-
-def _walk(pose: EgoPose, generator: torch.Generator) -> tuple[EgoPose, Motion]:
-    """One step on a slalom of half a metre around the origin: the true new pose, and what odometry tells of it."""
+def _walk(pose: EgoPose) -> EgoPose:
+    """One step on a slalom of half a metre around the origin."""
     radius, ahead = 0.25, 0.08
     around = math.atan2(pose.y_m, pose.x_m - radius) if (pose.x_m, pose.y_m) != (0.0, 0.0) else math.pi
     around += ahead / radius
-    new = EgoPose(radius + radius * math.cos(around), radius * math.sin(around), 0.35 * math.sin(2 * around))
-    back = _yaw(-pose.yaw_rad)
-    shift = back @ torch.tensor([new.x_m - pose.x_m, new.y_m - pose.y_m, 0.0], dtype=torch.float64)
-    rotation = _yaw(new.yaw_rad - pose.yaw_rad)
-    noise = torch.randn(3, generator=generator, dtype=torch.float64)
-    told = rotation @ _yaw(ODOMETRY_RAD * float(noise[2]))
-    error = torch.cat([ODOMETRY_M * noise[:2], torch.zeros(1, dtype=torch.float64)])
-    covariance = torch.diag(
-        torch.tensor([0.0, 0, ODOMETRY_RAD**2, ODOMETRY_M**2, ODOMETRY_M**2, 0], dtype=torch.float64)
-    )
-    return new, motion(told, shift + rotation @ error, covariance)
+    return EgoPose(radius + radius * math.cos(around), radius * math.sin(around), 0.35 * math.sin(2 * around))
 
 
 def study_moving(cfg: DictConfig, rows: Rows) -> None:
@@ -64,17 +49,17 @@ def study_moving(cfg: DictConfig, rows: Rows) -> None:
         found: dict[int, list[Any]] = {t: [] for t in marks}
         for k in range(seed, seed + whole(cfg, "episodes")):
             arena = build_arena(cfg, observer, k)
-            scene, generator = arena.world.scene, torch.Generator().manual_seed(k)
+            generator = torch.Generator().manual_seed(k)
             memory = new_memory(observer, build_cells(cfg, observer.head, generator))
             cells, pose = memory.cells, EgoPose()
             for gaze in fixation_course(arena, cells, FIRST_LOOKS, k):
                 memory = _look(observer, memory, arena, gaze, generator)
             for t in range(moves + 1):
                 if t > 0:
-                    pose, step = _walk(pose, generator)
+                    before, pose = pose, _walk(pose)
+                    step = ODOMETRY.tell(before, pose, generator)
                     memory = move(memory, step, observer.fusion)
-                    world = World(stand_at(scene, pose), camera=observer.camera, source_px=arena.world.source_px)
-                    arena = SimulatedArena(world, observer, arena.matcher, arena.sample, k)
+                    arena.world.stand(pose)
                     for gaze in list(fixation_course(arena, cells, looks + 1, 1000 * t + k))[1:]:
                         memory = _look(observer, memory, arena, gaze, generator)
                 if t in marks:

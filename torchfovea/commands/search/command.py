@@ -12,7 +12,14 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
 
-from torchfovea.commands.shared.build import build_match, build_motor, build_observer, build_renderer, name_of
+from torchfovea.commands.shared.build import (
+    build_match,
+    build_motor,
+    build_observer,
+    build_renderer,
+    build_route,
+    name_of,
+)
 from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.manifest import complete, finished
 from torchfovea.commands.shared.memories import loaded_memory, memory_path
@@ -56,7 +63,7 @@ def run(cfg: DictConfig) -> float:
     require(isinstance(cfg.record, bool), "record", cfg.record, "true or false")
     require(not (cfg.record and cfg.fidelity == "geometric"), "record", True, "images, fidelity=photometric")
     # mistakes come first, also in what is not used
-    build_strategy(cfg, observer), build_match(cfg), build_motor(cfg), loaded_memory(cfg, observer)
+    build_strategy(cfg, observer), build_match(cfg), build_motor(cfg), build_route(cfg), loaded_memory(cfg, observer)
     saved = memory_path(cfg, "memory.save")
     done = finished(cfg, folder)
     if done is not None:

@@ -25,6 +25,7 @@ from torchfovea.sim.arena import SimulatedArena
 from torchfovea.sim.motor import Motor
 from torchfovea.sim.rays import Renderer
 from torchfovea.sim.scene import Room, Scene, build_scene
+from torchfovea.sim.walk import Route
 from torchfovea.sim.world import World
 from torchfovea.stereo.external import External
 from torchfovea.stereo.matchers import Match, Matcher
@@ -40,6 +41,7 @@ __all__ = [
     "build_motor",
     "build_observer",
     "build_renderer",
+    "build_route",
     "build_scene_of",
     "build_sensor",
     "choice",
@@ -177,7 +179,17 @@ def build_arena(cfg: DictConfig, observer: Observer, seed: int) -> SimulatedAren
     )
     match = build_match(cfg)  # checked even where it is not used
     sample = None if OmegaConf.select(cfg, "sensor.sample") is None else whole(cfg, "sensor.sample", 16)
-    return SimulatedArena(world, observer, None if fidelity == "geometric" else match, sample, seed)
+    geometric, route = fidelity == "geometric", build_route(cfg)
+    return SimulatedArena(world, observer, None if geometric else match, sample, seed, route)
+
+
+def build_route(cfg: DictConfig) -> Route | None:
+    """Where the base goes; None: it stands still."""
+    if "motion" not in cfg or name_of(cfg, "motion") == "still":
+        return None
+    route: Route = build_named(cfg, "motion", "a torchfovea.sim.walk.Route", ("name",))
+    require(isinstance(route, Route), "motion", type(route).__name__, "a torchfovea.sim.walk.Route")
+    return route
 
 
 def build_match(cfg: DictConfig) -> Match:

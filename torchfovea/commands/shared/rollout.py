@@ -34,7 +34,8 @@ StrategyFor = Callable[[Sequence[Truth]], Strategy]
 
 def batched(cfg: DictConfig) -> bool:
     """Whether the episodes of a configuration can advance together."""
-    return bool(cfg.fidelity == "geometric" and name_of(cfg, "motor") == "instant")
+    still = "motion" not in cfg or name_of(cfg, "motion") == "still"
+    return bool(cfg.fidelity == "geometric" and name_of(cfg, "motor") == "instant" and still)
 
 
 def device_of(cfg: DictConfig) -> str:
@@ -45,7 +46,7 @@ def device_of(cfg: DictConfig) -> str:
     """
     device = choice(cfg, "device", ("cpu", "cuda"))
     require(device == "cpu" or torch.cuda.is_available(), "device", device, "cpu, or cuda on a machine that has it")
-    require(device == "cpu" or batched(cfg), "device", device, "cpu, or fidelity=geometric motor=instant")
+    require(device == "cpu" or batched(cfg), "device", device, "cpu, or fidelity=geometric motor=instant motion=still")
     return device
 
 
