@@ -32,6 +32,7 @@ FLOORS = (
         "retina",
         "sheets",
         "head",
+        "kinematics",
         "unscented",
         "chart",
         "significance",

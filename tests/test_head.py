@@ -149,7 +149,7 @@ def test_clamp():
         ("baseline_m", 0.0),
         ("pan_limit_deg", 190.0),
         ("tilt_down_deg", 90.0),
-        ("vergence_max_deg", 0.0),
+        ("vergence_max_deg", -1.0),
         ("eyes_up_m", math.inf),
         ("baseline_m", math.inf),
     ],

@@ -41,7 +41,7 @@ from torchfovea.memory.update import Common, remember
 from torchfovea.memory.voting import against, within_sight
 from torchfovea.sensing.camera import Camera, Pinhole
 from torchfovea.sensing.correspondence import Budget, Correspondences
-from torchfovea.sensing.head import Eyes, Gaze, Head, can_fixate, cyclopean, fixate
+from torchfovea.sensing.head import Eyes, Gaze, Head, Kinematics, can_fixate, cyclopean, fixate
 from torchfovea.sensing.kinship import kinship
 from torchfovea.sensing.layout import LogPolar, Retina
 from torchfovea.sensing.triangulation import observe
@@ -58,7 +58,7 @@ class Observer:
     """Everything about the observer that does not change while it looks around.
 
     Attributes:
-        head: kinematics and limits.
+        head: kinematics and limits: a `Head`, or one of your own (`torchfovea.sensing.head.Kinematics`).
         camera: both eyes' camera, in retinal pixels.
         retina: both eyes' retina.
         budget: where a correspondence's standard deviation comes from.
@@ -75,7 +75,7 @@ class Observer:
     How it chooses among them is no part of it: `decide` and `torchfovea.search.search` take a `strategy`.
     """
 
-    head: Head = field(default_factory=Head)
+    head: Any = field(default_factory=Head)
     camera: Camera = field(default_factory=lambda: Pinhole.from_fov(135.0, 100.0))
     retina: Retina = field(default_factory=LogPolar)
     budget: Budget = field(default_factory=Budget)
@@ -92,12 +92,12 @@ class Observer:
         """Raise SettingError for an unknown reward, and for a strategy."""
         given = getattr(acquisition, "__name__", type(acquisition).__name__)
         require(acquisition is None, "Observer(acquisition)", given, "decide(..., strategy=) or search(..., strategy=)")
+        require(isinstance(self.head, Head | Kinematics), "head", self.head, "a Head, or Kinematics")
         known = self.reward in ("inverse_range", "range") or callable(self.reward)
         require(known, "reward", self.reward, "inverse_range, range or a function of points (..., 3)")
         near = self.classes is None or self.reward == "inverse_range"
-        require(
-            near, "reward", self.reward, "inverse_range for the nearest of a class, which is worth more than nothing"
-        )
+        expected = "inverse_range for the nearest of a class, which is worth more than nothing"
+        require(near, "reward", self.reward, expected)
 
 
 class Step(NamedTuple):

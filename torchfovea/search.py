@@ -21,7 +21,7 @@ from torchfovea.memory.moving import move as move_memory
 from torchfovea.perception import Observer, Step, check_owner, decide, gaze_at, perceive
 from torchfovea.rows import row, stack
 from torchfovea.sensing.correspondence import Correspondences
-from torchfovea.sensing.head import Eyes, Gaze, Head, eyes, fixate, gaze_point
+from torchfovea.sensing.head import Eyes, Gaze, Head, Kinematics, eyes, fixate, gaze_point
 from torchfovea.setting import require
 
 __all__ = ["Glance", "Look", "Move", "Robot", "StopRule", "search", "seen_from", "steadied"]
@@ -172,7 +172,7 @@ def _course(
         yield Glance(move, look, step, looked, seconds)
 
 
-def seen_from(head: Head, gaze: Gaze, base: Motion | None = None) -> Eyes:
+def seen_from(head: Head | Kinematics, gaze: Gaze, base: Motion | None = None) -> Eyes:
     """Where the eyes were when late images were taken, in the ego frame of now: the `eyes` of a `Look`.
 
     Args:
@@ -189,7 +189,7 @@ def seen_from(head: Head, gaze: Gaze, base: Motion | None = None) -> Eyes:
     return Eyes(turn.mT @ pose.R_left, left, turn.mT @ pose.R_right, right)
 
 
-def steadied(head: Head, gaze: Gaze, base: Motion) -> Gaze:
+def steadied(head: Head | Kinematics, gaze: Gaze, base: Motion) -> Gaze:
     """The gaze that meets the same point after the base has moved, as near as the head can turn to it.
 
     Args:

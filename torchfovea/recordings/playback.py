@@ -12,10 +12,10 @@ from torchfovea.looking import look_at
 from torchfovea.perception import Observer
 from torchfovea.recordings.frames import Calibration, Moment, Recording, Refuse
 from torchfovea.search import Look, Move
-from torchfovea.sensing.head import Gaze, Head, cyclopean
+from torchfovea.sensing.head import Gaze, Head, Kinematics, cyclopean
 from torchfovea.setting import SettingError, require
 from torchfovea.stereo.matchers import Match
-from torchfovea.stereo.rig import verged
+from torchfovea.stereo.rig import rig_at
 from torchfovea.stereo.views import Views, posed_views
 
 __all__ = ["Playback", "observer_of", "views_of"]
@@ -79,11 +79,11 @@ class Playback:
         return look_at(self.observer, views, self.matcher, generator, self.sample)
 
 
-def views_of(moment: Moment, calibration: Calibration, head: Head, gaze: Gaze) -> Views:
+def views_of(moment: Moment, calibration: Calibration, head: Head | Kinematics, gaze: Gaze) -> Views:
     """A moment's images as matchers want them, the head being believed to be at a gaze."""
     assert moment.left is not None and moment.right is not None
     left, right = calibration.left, calibration.right
-    rig = verged(gaze.vergence, head.baseline_m)
+    rig = rig_at(head, gaze)
     return posed_views(moment.left, moment.right, left, right, rig, (left.cx_px, left.cy_px))
 
 

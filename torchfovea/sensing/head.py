@@ -9,18 +9,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchfovea.gaussian import columns
+from torchfovea.sensing.kinematics import Eyes, Gaze, Kinematics, axes_meet, rig_frame, to_ego
 from torchfovea.setting import require
 
 __all__ = [
     "Eyes",
     "Gaze",
     "Head",
+    "Kinematics",
     "can_fixate",
     "clamp_gaze",
     "cyclopean",
@@ -35,39 +35,12 @@ __all__ = [
 _FARTHEST_M = 1e12
 
 
-class Gaze(NamedTuple):
-    """Where the head looks; all [rad], any common shape (...).
-
-    Attributes:
-        pan: neck pan, positive to the left.
-        tilt: neck tilt, positive down.
-        vergence: angle between the optical axes; each eye turns half of it inward.
-    """
-
-    pan: Tensor
-    tilt: Tensor
-    vergence: Tensor
-
-
-class Eyes(NamedTuple):
-    """Poses of the two cameras in the ego frame: X_E = R X_camera + t.
-
-    Attributes:
-        R_left: (..., 3, 3), columns are the left camera's axes in E.
-        t_left: (..., 3), the left camera's centre in E [m].
-        R_right: (..., 3, 3).
-        t_right: (..., 3) [m].
-    """
-
-    R_left: Tensor
-    t_left: Tensor
-    R_right: Tensor
-    t_right: Tensor
-
-
 @dataclass(frozen=True)
 class Head:
     """Geometry and limits of a stereo head; the defaults are Vizzy's.
+
+    A rectified pair on a pan-tilt unit is one with `vergence_max_deg` 0, a pair that does not move one with limits of 0
+    and some `sight_deg`.
 
     Attributes:
         baseline_m: distance between the eyes, > 0.
@@ -77,7 +50,8 @@ class Head:
         pan_limit_deg: neck pan reaches this far to either side.
         tilt_up_deg: neck tilt upward.
         tilt_down_deg: neck tilt downward.
-        vergence_max_deg: largest angle between the optical axes.
+        vergence_max_deg: largest angle between the optical axes; 0: they are parallel, and the axis between them looks.
+        sight_deg: a point still counts as looked at so far beyond what the head can turn to.
         encoder_deg: standard deviation of what the encoders tell of pan, tilt and vergence.
     """
 
@@ -89,26 +63,38 @@ class Head:
     tilt_up_deg: float = 18.0
     tilt_down_deg: float = 37.0
     vergence_max_deg: float = 40.0
+    sight_deg: float = 0.0
     encoder_deg: float = 0.0
 
     def __post_init__(self) -> None:
         """Raise SettingError for a head that cannot exist."""
         positive = 0 < self.baseline_m < math.inf
         require(positive, "head.baseline_m", self.baseline_m, "a positive distance in metres")
-        require(0 < self.pan_limit_deg < 180, "head.pan_limit_deg", self.pan_limit_deg, "between 0 and 180 degrees")
+        require(
+            0 <= self.pan_limit_deg < 180, "head.pan_limit_deg", self.pan_limit_deg, "from 0 to less than 180 degrees"
+        )
+        require(0 <= self.sight_deg < 90, "head.sight_deg", self.sight_deg, "from 0 to less than 90 degrees")
+        if self.sight_deg == 0:
+            require(self.pan_limit_deg > 0, "head.pan_limit_deg", 0, "some range, or some head.sight_deg")
         for name in ("tilt_up_deg", "tilt_down_deg"):
             require(
                 0 <= getattr(self, name) < 90, f"head.{name}", getattr(self, name), "from 0 to less than 90 degrees"
             )
-        require(self.tilt_up_deg + self.tilt_down_deg > 0, "head.tilt_down_deg", self.tilt_down_deg, "some tilt range")
-        require(
-            0 < self.vergence_max_deg < 180, "head.vergence_max_deg", self.vergence_max_deg, "between 0 and 180 degrees"
-        )
+        tilts = self.tilt_up_deg + self.tilt_down_deg + self.sight_deg > 0
+        require(tilts, "head.tilt_down_deg", self.tilt_down_deg, "some range, or some head.sight_deg")
+        vergence = self.vergence_max_deg
+        require(0 <= vergence < 180, "head.vergence_max_deg", vergence, "from 0 to less than 180 degrees")
         require(0 <= self.encoder_deg < 10, "head.encoder_deg", self.encoder_deg, "from 0 to less than 10 degrees")
         for name in ("eyes_forward_m", "eyes_up_m", "ego_height_m"):
             require(
                 math.isfinite(getattr(self, name)), f"head.{name}", getattr(self, name), "a finite length in metres"
             )
+
+    @property
+    def nearest_m(self) -> float:
+        """How near to the eyes their axes can meet; 0 if they need not."""
+        half = math.radians(self.vergence_max_deg) / 2
+        return self.baseline_m / 2 / math.tan(half) if half > 0 else 0.0
 
 
 def _rotation(rows: tuple[tuple[Tensor, ...], ...]) -> Tensor:
@@ -116,8 +102,8 @@ def _rotation(rows: tuple[tuple[Tensor, ...], ...]) -> Tensor:
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
-def cyclopean(head: Head, gaze: Gaze) -> tuple[Tensor, Tensor]:
-    """Pose of the cyclopean frame in E.
+def cyclopean(head: Head | Kinematics, gaze: Gaze) -> tuple[Tensor, Tensor]:
+    """Pose of the cyclopean frame in E; of a head of your own, of the rectified frame (`rig_frame`).
 
     Returns:
         R (..., 3, 3), whose columns are C's x (right), y (down) and z (forward) axes in E, and its origin
@@ -130,6 +116,8 @@ def cyclopean(head: Head, gaze: Gaze) -> tuple[Tensor, Tensor]:
     """
     kinds = {str(angle.dtype) for angle in gaze}
     require(len(kinds) == 1 and gaze.pan.is_floating_point(), "gaze.dtype", sorted(kinds), "one floating-point dtype")
+    if not isinstance(head, Head):
+        return rig_frame(head.eyes(gaze))[:2]
     cp, sp = torch.cos(gaze.pan), torch.sin(gaze.pan)
     ct, st = torch.cos(gaze.tilt), torch.sin(gaze.tilt)
     zero = torch.zeros_like(cp)
@@ -138,11 +126,13 @@ def cyclopean(head: Head, gaze: Gaze) -> tuple[Tensor, Tensor]:
     return rotation, head.eyes_forward_m * rotation[..., 2] - head.eyes_up_m * rotation[..., 1]
 
 
-def eyes(head: Head, gaze: Gaze) -> Eyes:
+def eyes(head: Head | Kinematics, gaze: Gaze) -> Eyes:
     """Forward kinematics: the poses of both cameras in E (the left eye turns +θ/2 about the optical y, the right −θ/2).
 
     Differentiable in the gaze.
     """
+    if not isinstance(head, Head):
+        return head.eyes(gaze)
     rotation, origin = cyclopean(head, gaze)
     c, s = torch.cos(gaze.vergence / 2), torch.sin(gaze.vergence / 2)
     zero, one = torch.zeros_like(c), torch.ones_like(c)
@@ -151,22 +141,7 @@ def eyes(head: Head, gaze: Gaze) -> Eyes:
     return Eyes(rotation @ inward, origin - half, rotation @ inward.mT, origin + half)
 
 
-def to_ego(rotation: Tensor, vector: Tensor) -> Tensor:
-    """R v for each of N vectors.
-
-    Args:
-        rotation: (..., 3, 3).
-        vector: (*any, ..., N, 3).
-
-    Returns:
-        The shape of `vector`, in columns. Differentiable.
-    """
-    x, y, z = vector.unbind(-1)
-    row = [[rotation[..., i, j].unsqueeze(-1) for j in range(3)] for i in range(3)]
-    return columns(*(torch.addcmul(torch.addcmul(r[0] * x, r[1], y), r[2], z) for r in row))
-
-
-def fixate(head: Head, point: Tensor) -> tuple[Gaze, Tensor]:
+def fixate(head: Head | Kinematics, point: Tensor) -> tuple[Gaze, Tensor]:
     """Inverse kinematics: the gaze in which both optical axes meet at a point.
 
     Args:
@@ -182,6 +157,8 @@ def fixate(head: Head, point: Tensor) -> tuple[Gaze, Tensor]:
 
     Differentiable in the point where it is reachable; zero gradient where it is not.
     """
+    if not isinstance(head, Head):
+        return head.fixate(point)
     (x, y, z), side, reach, solvable, within = _aim(head, point)
     distance = (reach - head.eyes_forward_m).clamp(min=1e-6)
     pan = torch.atan2(y, x)
@@ -197,13 +174,13 @@ def fixate(head: Head, point: Tensor) -> tuple[Gaze, Tensor]:
     return Gaze(*(torch.where(solvable, angle, torch.zeros_like(angle)) for angle in held)), within
 
 
-def can_fixate(head: Head, point: Tensor) -> Tensor:
+def can_fixate(head: Head | Kinematics, point: Tensor) -> Tensor:
     """Whether the head can fixate points (..., 3) in E, bool (...): the second result of `fixate`, without the angles.
 
     Raises:
         SettingError: for a point of another shape or type.
     """
-    return _aim(head, point.detach())[-1]
+    return (_aim(head, point.detach()) if isinstance(head, Head) else head.fixate(point.detach()))[-1]
 
 
 def _limits_deg(head: Head) -> tuple[float, float, float]:
@@ -235,23 +212,26 @@ def _aim(head: Head, point: Tensor) -> tuple[tuple[Tensor, ...], Tensor, Tensor,
     solvable = (side > 1e-12) & (ahead > max(forward + 1e-3, 1e-3) ** 2)
     x, y, z = (torch.where(solvable, c, one) for c in (x, y, z))
     side, reach = (torch.where(solvable, square, one).sqrt() for square in (side, ahead))
-    near = head.baseline_m / 2 / math.tan(math.radians(head.vergence_max_deg) / 2)
+    pan, low, high = _limits_deg(head)
+    reached = min(pan + head.sight_deg, 180.0), low - head.sight_deg, high + head.sight_deg
     with torch.no_grad():
         # angles α ≤ β where sin(β − α) ≥ 0: of pan, and of tilt, the angle from (side, z) to (reach, up)
         (pan_s, pan_c), (up_s, up_c), (down_s, down_c) = (
-            (math.sin(math.radians(a)), math.cos(math.radians(a))) for a in _limits_deg(head)
+            (math.sin(math.radians(a)), math.cos(math.radians(a))) for a in reached
         )
         sine, cosine = up * side - reach * z, reach * side + up * z
         within = (pan_s * x >= pan_c * y.abs()) & (up_c * sine >= up_s * cosine) & (down_c * sine <= down_s * cosine)
-        within &= solvable & (reach - forward >= near)
+        within &= solvable & (reach - forward >= head.nearest_m)
     return (x, y, z), side, reach, solvable, within
 
 
-def gaze_point(head: Head, gaze: Gaze) -> Tensor:
+def gaze_point(head: Head | Kinematics, gaze: Gaze) -> Tensor:
     """Where both optical axes meet, (..., 3) in E [m]: what `fixate` inverts; infinitely far without vergence.
 
-    Differentiable in the gaze where it converges.
+    Of a head of your own, where both are nearest to each other. Differentiable in the gaze where it converges.
     """
+    if not isinstance(head, Head):
+        return axes_meet(head.eyes(gaze))
     rotation, origin = cyclopean(head, gaze)
     distance = head.baseline_m / 2 / torch.tan(gaze.vergence / 2)
     axis = rotation[..., 2]
@@ -264,30 +244,3 @@ def clamp_gaze(head: Head, gaze: Gaze) -> Gaze:
         math.radians(a) for a in (head.pan_limit_deg, head.tilt_up_deg, head.tilt_down_deg, head.vergence_max_deg)
     )
     return Gaze(gaze.pan.clamp(-pan, pan), gaze.tilt.clamp(-up, down), gaze.vergence.clamp(0.0, widest))
-
-
-def rig_frame(eyes: Eyes) -> tuple[Tensor, Tensor, Tensor]:
-    """The rectified frame of two eyes: x along the baseline to the right, z midway between the optical axes.
-
-    For a head it is the cyclopean frame.
-
-    Args:
-        eyes: poses in E, (...).
-
-    Returns:
-        Its axes in E as the columns of R (..., 3, 3), its origin midway between the eyes t (..., 3) and the baseline
-        (...) [m].
-
-    Raises:
-        SettingError: for a baseline of no length.
-
-    Differentiable.
-    """
-    across = eyes.t_right - eyes.t_left
-    baseline = across.square().sum(-1).sqrt()
-    require(bool((baseline > 0).all()), "baseline_m", 0.0, "eyes some distance apart")
-    x = across / baseline[..., None]
-    z = eyes.R_left[..., 2] + eyes.R_right[..., 2]
-    z = z - (z * x).sum(-1, keepdim=True) * x
-    z = z / z.square().sum(-1, keepdim=True).sqrt()
-    return torch.stack([x, torch.linalg.cross(z, x), z], -1), (eyes.t_left + eyes.t_right) / 2, baseline

@@ -24,7 +24,7 @@ from torchfovea.sim.truth import truth_of
 from torchfovea.sim.walk import Route
 from torchfovea.sim.world import World
 from torchfovea.stereo.matchers import Match
-from torchfovea.stereo.rig import verged
+from torchfovea.stereo.rig import rig_at
 from torchfovea.stereo.views import verged_views
 
 __all__ = ["Pictures", "SimulatedArena"]
@@ -137,7 +137,7 @@ class SimulatedArena:
         """What the matcher makes of both eyes' pictures (3, H, W), the head being believed to be at a gaze."""
         assert self.matcher is not None
         head, camera, retina = self.observer.head, self.observer.camera, self.observer.retina
-        views = verged_views(left, right, verged(gaze.vergence, head.baseline_m), camera, retina.radius_px)
+        views = verged_views(left, right, rig_at(head, gaze), camera, retina.radius_px)
         return look_at(self.observer, views, self.matcher, generator, self.sample)
 
     def truth(self, cells: Tensor) -> Truth:

@@ -155,10 +155,11 @@ def _reachable(params: Cans, head: Head, point: np.ndarray) -> np.ndarray:
     margin = params.reach_margin_deg
     tight = replace(
         head,
-        pan_limit_deg=max(head.pan_limit_deg - margin, 1e-3),
+        pan_limit_deg=max(head.pan_limit_deg - margin, min(head.pan_limit_deg, 1e-3)),
         tilt_up_deg=max(head.tilt_up_deg - margin, 0.0),
-        tilt_down_deg=max(head.tilt_down_deg - margin, 1e-3),
-        vergence_max_deg=max(head.vergence_max_deg - margin, 1e-3),
+        tilt_down_deg=max(head.tilt_down_deg - margin, min(head.tilt_down_deg, 1e-3)),
+        vergence_max_deg=max(head.vergence_max_deg - margin, min(head.vergence_max_deg, 1e-3)),
+        sight_deg=max(head.sight_deg - margin, min(head.sight_deg, 1e-3)),
     )
     return fixate(tight, torch.from_numpy(point))[1].numpy()
 

@@ -30,12 +30,12 @@ def add_head(spec: Any, head: Head) -> None:
     spec.compiler.degree = False
     spec.option.timestep = 0.001
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    limits = {
-        "pan": (-math.radians(head.pan_limit_deg), math.radians(head.pan_limit_deg)),
-        "tilt": (-math.radians(head.tilt_up_deg), math.radians(head.tilt_down_deg)),
-        "left_eye": (0.0, math.radians(head.vergence_max_deg) / 2),
-        "right_eye": (-math.radians(head.vergence_max_deg) / 2, 0.0),
-    }
+    # an actuator has some range, be it none that shows
+    pan, up, down, half = (
+        max(math.radians(angle), 1e-6)
+        for angle in (head.pan_limit_deg, head.tilt_up_deg, head.tilt_down_deg, head.vergence_max_deg / 2)
+    )
+    limits = {"pan": (-pan, pan), "tilt": (-up, down), "left_eye": (0.0, half), "right_eye": (-half, 0.0)}
 
     def hinge(body: Any, name: str, axis: tuple[float, float, float]) -> None:
         low, high = limits[name]

@@ -29,10 +29,11 @@ def _reach(head: Head) -> tuple[float, float, float]:
     A point is at elevation asin(up / distance) − tilt; the first term is largest for the nearest distance that the
     vergence allows and falls to zero far away.
     """
-    near = head.baseline_m / 2 / math.tan(math.radians(head.vergence_max_deg) / 2) + head.eyes_forward_m
-    lift = math.atan2(head.eyes_up_m, max(near, 1e-3))
-    low = -math.radians(head.tilt_down_deg) + min(lift, 0.0)
-    return math.radians(head.pan_limit_deg), low, math.radians(head.tilt_up_deg) + max(lift, 0.0)
+    lift = math.atan2(head.eyes_up_m, max(head.nearest_m + head.eyes_forward_m, 1e-3))
+    more, straight = math.radians(head.sight_deg), math.radians(89.9)
+    low = max(-math.radians(head.tilt_down_deg) - more + min(lift, 0.0), -straight)
+    high = min(math.radians(head.tilt_up_deg) + more + max(lift, 0.0), straight)
+    return min(math.radians(head.pan_limit_deg) + more, math.pi), low, high
 
 
 def reachable_grid(head: Head, step_deg: float) -> Tensor:

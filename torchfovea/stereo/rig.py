@@ -8,9 +8,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchfovea.sensing.head import Eyes, Gaze, Head, Kinematics
 from torchfovea.setting import require
 
-__all__ = ["StereoRig", "posed", "verged"]
+__all__ = ["StereoRig", "posed", "rig_at", "verged"]
 
 
 class StereoRig(NamedTuple):
@@ -37,6 +38,15 @@ def verged(vergence_rad: float | Tensor, baseline_m: float) -> StereoRig:
     c, s = math.cos(half.item()), math.sin(half.item())
     rotation = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=torch.float64)
     return _rig(rotation, rotation.mT, baseline_m)
+
+
+def rig_at(head: Head | Kinematics, gaze: Gaze) -> StereoRig:
+    """The rig of a head, or of one of your own, at one gaze."""
+    if isinstance(head, Head):
+        return verged(gaze.vergence, head.baseline_m)
+    pose = Eyes(*(part.detach().cpu().double() for part in head.eyes(gaze)))
+    turn = pose.R_left.mT
+    return posed(turn @ pose.R_right, turn @ (pose.t_right - pose.t_left))
 
 
 def posed(R_left_right: Tensor, t_left_right_m: Tensor) -> StereoRig:

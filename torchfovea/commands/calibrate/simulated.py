@@ -9,11 +9,11 @@ import torch
 from omegaconf import DictConfig
 
 from torchfovea.commands.calibrate.truths import Truths, look_at_world
-from torchfovea.commands.shared.build import build_matcher, build_renderer, build_scene_of, build_sensor, construct
+from torchfovea.commands.shared.build import build_head, build_matcher, build_renderer, build_scene_of, build_sensor
 from torchfovea.commands.shared.parallel import spread, workers_of
 from torchfovea.commands.shared.progress import progress_bar
 from torchfovea.sensing.correspondence import Budget
-from torchfovea.sensing.head import Gaze, Head, fixate
+from torchfovea.sensing.head import Gaze, fixate
 from torchfovea.setting import SettingError
 from torchfovea.sim.scene import Scene
 from torchfovea.sim.world import World
@@ -61,7 +61,7 @@ def looks_at(task: SceneTask) -> list[Truths]:
     sized = task.cfg.copy()
     sized.sensor.fov_deg = task.fov_deg
     camera, retina = build_sensor(sized)
-    scene = build_scene_of(sized, construct(Head, sized.head, "head"), task.seed)
+    scene = build_scene_of(sized, build_head(sized), task.seed)
     world = World(
         scene,
         renderer=build_renderer(sized),

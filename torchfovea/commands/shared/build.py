@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -12,11 +13,12 @@ from torchfovea.commands.shared.budgets import build_budget
 from torchfovea.commands.shared.named import build_named, name_of, targets_of
 from torchfovea.commands.shared.rewards import build_classes, build_reward
 from torchfovea.commands.shared.settings import choice, construct, number, typed, whole
+from torchfovea.imported import load_function
 from torchfovea.memory import sphere
 from torchfovea.memory.egosphere import Fusion, Prior
 from torchfovea.perception import Eligibility, Observer
 from torchfovea.sensing.camera import Camera, Fisheye, Pinhole
-from torchfovea.sensing.head import Head, fixate
+from torchfovea.sensing.head import Head, Kinematics, fixate
 from torchfovea.sensing.layout import Retina
 from torchfovea.sensing.own_layout import check_retina
 from torchfovea.sensing.unscented import SigmaPoints
@@ -36,6 +38,7 @@ __all__ = [
     "build_arena",
     "build_camera",
     "build_cells",
+    "build_head",
     "build_match",
     "build_matcher",
     "build_motor",
@@ -85,7 +88,7 @@ def build_observer(cfg: DictConfig) -> Observer:
     budget = build_budget(cfg)
     printed = choice(cfg, "budget.sigma_points", ("ours", "paper")) == "paper"
     return Observer(
-        head=construct(Head, cfg.head, "head"),
+        head=build_head(cfg),
         camera=camera,
         retina=retina,
         budget=budget,
@@ -97,6 +100,17 @@ def build_observer(cfg: DictConfig) -> Observer:
         eligibility=construct(Eligibility, cfg.eligibility, "eligibility"),
         classes=build_classes(cfg),
     )
+
+
+def build_head(cfg: DictConfig) -> Any:
+    """The head: a `Head`, or a user's own kinematics by ``source=package.module:function``."""
+    if "source" not in cfg.head:
+        return construct(Head, cfg.head, "head")
+    form = "package.module:function, a function without arguments that returns a torchfovea.sensing.head.Kinematics"
+    require(cfg.head.source is not None, "head.source", None, form)
+    head = load_function(cfg.head.source, "head.source")()
+    require(isinstance(head, Head | Kinematics), "head", type(head).__name__, form)
+    return head
 
 
 def build_cells(cfg: DictConfig, head: Head, generator: torch.Generator, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -131,6 +145,8 @@ def build_cells(cfg: DictConfig, head: Head, generator: torch.Generator, dtype: 
 
 def build_scene_of(cfg: DictConfig, head: Head, seed: int) -> Scene:
     """The scene of a configuration's group `scene`."""
+    known = isinstance(head, Head)
+    require(known, "head", type(head).__name__, "one that the simulator knows; yours is for `replay` and a robot")
     name_of(cfg, "scene")
     if "room" in cfg.scene and "_target_" not in cfg.scene.room:  # as scene files were before _target_
         merged = OmegaConf.merge(cfg, {"scene": {"room": {"_target_": f"{Room.__module__}.{Room.__name__}"}}})
