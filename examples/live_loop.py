@@ -1,4 +1,4 @@
-"""A live search: a robot's two cameras and its neck, here the simulator's; replace `Robot` by yours.
+"""A live search: a robot's two cameras and its neck, here the simulator's; replace `Robot` by yours (docs/live.md).
 
 python examples/live_loop.py
 """
@@ -10,7 +10,7 @@ from torchfovea.search import Look, Move, search
 from torchfovea.sim.scene import Cans, build_scene
 from torchfovea.sim.world import World
 from torchfovea.stereo.matching import match_sgbm
-from torchfovea.stereo.rig import verged
+from torchfovea.stereo.rig import rig_at
 from torchfovea.stereo.views import verged_views
 
 
@@ -26,7 +26,7 @@ class Robot:
 
     def look(self, gaze: tf.Gaze, generator: object) -> Look:  # grab both images and match them
         left, right = (frame.image for frame in self.world.images())
-        rig, retina = verged(gaze.vergence, self.observer.head.baseline_m), self.observer.retina
+        rig, retina = rig_at(self.observer.head, gaze), self.observer.retina
         return Look(*match_sgbm(verged_views(left, right, rig, self.observer.camera, retina.radius_px), retina))
 
 
