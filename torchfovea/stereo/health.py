@@ -39,7 +39,7 @@ ROWS_PX = 1.5
 """Rows that are further apart than this are an error [image px]: matchers lose surfaces, and errors are no longer small
 beside a window."""
 
-ROWS_NOTED_PX = 0.3
+ROWS_NOTED_PX = 0.5
 FEWEST = 20  # matches that tell anything
 DARK, BRIGHT = 4 / 255, 254 / 255
 SATURATED = 0.25  # share of the pixels
