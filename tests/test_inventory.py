@@ -44,6 +44,7 @@ FRONT_DOOR = [
     "belief",
     "cartesian_belief",
     "choose",
+    "cortical",
     "cyclopean",
     "decide",
     "direction_mixture",
@@ -52,6 +53,7 @@ FRONT_DOOR = [
     "fixate",
     "forget",
     "fovea",
+    "interpolate",
     "load_memory",
     "log_density",
     "log_expected_improvement",
@@ -60,6 +62,7 @@ FRONT_DOOR = [
     "new_memory",
     "observe",
     "perceive",
+    "place_features",
     "reconstruct",
     "remember",
     "resample",
@@ -68,6 +71,7 @@ FRONT_DOOR = [
     "triangulate",
     "unscented_transform",
     "upper_confidence_bound",
+    "wrap_around",
 ]
 
 # Names that two modules define on purpose: which modules, by reason.

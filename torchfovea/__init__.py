@@ -19,10 +19,11 @@ from torchfovea.memory.update import remember
 from torchfovea.perception import Eligibility, Observer, decide, new_memory, perceive
 from torchfovea.sensing.camera import Fisheye, Pinhole
 from torchfovea.sensing.correspondence import Budget, Correspondences
+from torchfovea.sensing.features import place_features, wrap_around
 from torchfovea.sensing.head import Eyes, Gaze, Head, cyclopean, eyes, fixate
-from torchfovea.sensing.layout import LogPolar, Uniform
+from torchfovea.sensing.layout import LogPolar, Uniform, cortical
 from torchfovea.sensing.lens import BrownConrady, KannalaBrandt
-from torchfovea.sensing.retina import fovea, reconstruct
+from torchfovea.sensing.retina import fovea, interpolate, reconstruct
 from torchfovea.sensing.triangulation import Observations, observe, triangulate
 from torchfovea.sensing.unscented import SigmaPoints, unscented_transform
 from torchfovea.setting import SettingError
@@ -56,6 +57,7 @@ __all__ = [
     "belief",
     "cartesian_belief",
     "choose",
+    "cortical",
     "cyclopean",
     "decide",
     "direction_mixture",
@@ -64,6 +66,7 @@ __all__ = [
     "fixate",
     "forget",
     "fovea",
+    "interpolate",
     "load_memory",
     "log_density",
     "log_expected_improvement",
@@ -72,6 +75,7 @@ __all__ = [
     "new_memory",
     "observe",
     "perceive",
+    "place_features",
     "reconstruct",
     "remember",
     "resample",
@@ -80,4 +84,5 @@ __all__ = [
     "triangulate",
     "unscented_transform",
     "upper_confidence_bound",
+    "wrap_around",
 ]

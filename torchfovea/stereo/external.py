@@ -200,7 +200,8 @@ def _check_sign(disparity: Tensor, doffs_px: float, width: int, scale: float) ->
     if disparity.numel() == 0:
         return
     span = f"{float(disparity.min()):.4g} to {float(disparity.max()):.4g} px"
-    behind, beyond = (float(those.float().mean()) for those in (disparity < -doffs_px, disparity > width))
+    # noise may carry infinity to −1 px
+    behind, beyond = (float(those.float().mean()) for those in (disparity < -doffs_px - 1, disparity > width))
     form = "x_left - x_right in pixels, of points ahead; {} by matcher.scale={:g}"
     require(behind <= 0.5, "disparities", span, form.format("turn the sign round", -scale))
     require(beyond <= 0.5, "disparities", span, form.format("sixteenths become pixels", scale / 16))
