@@ -72,14 +72,13 @@ def s2m2(path, size=SIZE):
     )  # fmt: skip
 
 
-def two_to_one(path, names=("left", "right"), out="disp", dtype=TensorProto.FLOAT, size=("h", "w"), extra=()):
-    """Disparity = left's red less right's, at the inputs' size."""
-    shape = ["b", 3, *size]
+def two_to_one(path, names=("left", "right"), out="disp", dtype=TensorProto.FLOAT, extra=()):
+    """Disparity = left's red less right's, at the inputs' size, whose symbols each exporter names as it likes."""
     return write(
         path,
-        [*((name, dtype, shape) for name in names), *extra],
+        [*((name, dtype, ["b", 3, f"height_{name}", f"width_{name}"]) for name in names), *extra],
         [*red(names[0], "l"), *red(names[1], "r"), ("Sub", ["l", "r"], [out], {})],
-        [(out, TensorProto.FLOAT, ["b", 1, *size])],
+        [(out, TensorProto.FLOAT, ["b", 1, "height", "width"])],
         [ZERO],
     )
 
@@ -161,6 +160,11 @@ def test_the_networks_get_their_images_and_give_disparities(tmp_path):
     np.testing.assert_allclose(scaled(left, right).numpy(), (left - right)[..., 0] / 0.2, atol=1e-6)
     swapped = OnnxModel(two_to_one(tmp_path / "s.onnx", names=("b", "a")), left="a", right="b")
     np.testing.assert_allclose(swapped(left, right).numpy(), -difference, atol=2e-5)
+    # one name tells the other
+    for settings in (dict(left="a"), dict(right="b")):
+        np.testing.assert_allclose(
+            OnnxModel(tmp_path / "s.onnx", **settings)(left, right).numpy(), -difference, atol=2e-5
+        )
 
 
 @pytest.mark.parametrize("size", [(50, 70), (64, 96), (33, 96)])
@@ -299,6 +303,7 @@ def test_a_model_that_does_not_fit_is_told_in_one_line(tmp_path):
         (dict(model=good, disparity="depth"), r"source\.disparity = depth: expected an output of the model: disp"),
         (dict(model=good, worth="conf"), r"matcher\.source\.worth = conf: expected an output"),
         (dict(model=two_to_one(tmp_path / "x.onnx", extra=extra)), "flow_init.*: expected two images"),
+        (dict(model=good, left="left", right="left"), "expected one an image, or one for both"),
         (dict(model=alone), "inputs image .*: expected two images"),
         (dict(model=words), r"input left = tensor\(int64\): expected one of"),
         (dict(model=deep, size_px=[32, 96]), r"size_px = \[32, 96\]: expected \[64, 96\]"),

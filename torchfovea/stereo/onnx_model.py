@@ -186,15 +186,20 @@ class OnnxModel:
         where = f"matcher.model = {self.model}"
         inputs = {one.name: one for one in session.get_inputs()}
         told = ", ".join(f"{name} {one.type} {one.shape}" for name, one in inputs.items())
-        names = [name for name in (self.left, self.right) if name is not None] or list(inputs)
         for setting, name in (("left", self.left), ("right", self.right)):
             require(name is None or name in inputs, f"matcher.source.{setting}", name, f"an input of the model: {told}")
-        require(len(names) in (1, 2) and len(inputs) == len(names), where, f"inputs {told}", "two images")
+        require(len(inputs) in (1, 2), where, f"inputs {told}", "two images")
+        left = self.left or next(name for name in inputs if name != self.right or len(inputs) == 1)
+        names = [left, *([self.right] if self.right else (name for name in inputs if name != left))]
+        require(
+            len(set(names)) == len(inputs) == len(names), where, f"inputs {told}", "one for each image, or for both"
+        )
         chosen = [inputs[name] for name in names]
-        shapes = [one.shape for one in chosen]
+        # what is no number is a size that may be any
+        shapes = [[side if isinstance(side, int) else None for side in one.shape] for one in chosen]
         fits = all(len(shape) == 4 for shape in shapes) and all(shape == shapes[0] for shape in shapes)
         require(fits, where, f"inputs {told}", "images (1, 3, height, width), of one size")
-        batch, channels = (side if isinstance(side, int) else None for side in shapes[0][:2])
+        batch, channels, height, width = shapes[0]
         if len(names) == 2:
             stacked, images = 0, batch in (1, None) and channels in (1, 3, None)
         else:
@@ -205,12 +210,10 @@ class OnnxModel:
         require(images, where, f"inputs {told}", form)
         for one in chosen:
             require(one.type in TYPES, f"{where}: input {one.name}", one.type, "one of " + ", ".join(TYPES))
-        height, width = (side if isinstance(side, int) else None for side in shapes[0][2:])
         if self.size_px is not None:
             free = all(fixed in (None, w) for fixed, w in zip((height, width), self.size_px, strict=True))
-            require(
-                free, "matcher.source.size_px", list(self.size_px), f"{[height, width]}, which the model is made for"
-            )
+            form = f"{[height, width]}, which the model is made for"
+            require(free, "matcher.source.size_px", list(self.size_px), form)
         outputs = [one.name for one in session.get_outputs()]
         for setting, name in (("disparity", self.disparity), ("worth", self.worth)):
             form = f"an output of the model: {', '.join(outputs)}"
