@@ -191,9 +191,7 @@ class OnnxModel:
         require(len(inputs) in (1, 2), where, f"inputs {told}", "two images")
         left = self.left or next(name for name in inputs if name != self.right or len(inputs) == 1)
         names = [left, *([self.right] if self.right else (name for name in inputs if name != left))]
-        require(
-            len(set(names)) == len(inputs) == len(names), where, f"inputs {told}", "one for each image, or for both"
-        )
+        require(len(set(names)) == len(inputs) == len(names), where, f"inputs {told}", "one an image, or one for both")
         chosen = [inputs[name] for name in names]
         # what is no number is a size that may be any
         shapes = [[side if isinstance(side, int) else None for side in one.shape] for one in chosen]
