@@ -44,7 +44,7 @@ def test_the_installed_wheel_finds_its_own_conf(wheel, tmp_path):
     elsewhere.mkdir()
     pip = (sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index")
     run(*pip, "--target", str(target), str(wheel), cwd=elsewhere)
-    out = run(sys.executable, "-m", "torchfovea", "doctor", cwd=elsewhere, PYTHONPATH=str(target))
+    out = run(sys.executable, "-m", "torchfovea", "doctor", "save=true", cwd=elsewhere, PYTHONPATH=str(target))
     folder = Path(out.splitlines()[-1])
     assert folder.is_relative_to(elsewhere)
     with (folder / "doctor.csv").open(newline="") as file:

@@ -19,13 +19,13 @@ from torchfovea.memory.egosphere import Memory
 from torchfovea.metrics import gap, global_information, local_information, near_target, regret, saccades_to_target
 from torchfovea.perception import Observer, Step
 from torchfovea.rows import row, stack
-from torchfovea.search import Look, Move, StopRule, search
+from torchfovea.search import Glance, Look, Move, StopRule, search
 from torchfovea.sensing.head import Gaze, gaze_point
 from torchfovea.setting import require
 
-__all__ = ["Episode", "Rules", "run_episode", "run_episodes"]
+__all__ = ["Each", "Episode", "Rules", "run_episode", "run_episodes"]
 
-Each = Callable[[int, Look, Step], None]
+Each = Callable[[int, Glance], None]
 
 
 class Episode(NamedTuple):
@@ -115,15 +115,17 @@ def run_episode(
         truth: for the metrics only.
         generator: draws sensor noise and breaks ties; the same seed gives the same episode.
         rules: how long, by which strategy, and what counts.
-        each: called after every decision with t (from 0), the look and the step.
+        each: called after every decision with t (from 0) and the glance.
 
     Raises:
         SettingError: for a nearest range that is not between 0 and far_m.
     """
 
-    def show(t: int, look: Look, step: Step) -> None:
-        if each is not None:
-            each(t, Look(row(look.matches, 0), look.pictures[0]), row(step._replace(state=None), 0))
+    def show(t: int, glance: Glance) -> None:
+        if each is not None and glance.look is not None:
+            look, step = glance.look, glance.step._replace(state=None)
+            alone = row(glance._replace(look=None, step=step), 0)
+            each(t, alone._replace(look=Look(row(look.matches, 0), look.pictures[0])))
 
     episode = run_episodes(observer, stack([memory]), Arenas([arena]), [truth], [generator], rules, show)[0]
     return episode._replace(look=Look(episode.look.matches, episode.look.pictures[0]))
@@ -147,7 +149,7 @@ def run_episodes(
         truths: for the metrics only, B; of bases that move at the start, `Arenas.truths` tells the others.
         generators: one for each episode; the same seed gives the same episode, whatever the batch.
         rules: how long, by which strategy, and what counts.
-        each: called after every decision with t (from 0), the looks and the steps.
+        each: called after every decision with t (from 0) and the glances as one.
 
     Raises:
         SettingError: for a nearest range that is not between 0 and far_m.
@@ -179,7 +181,7 @@ def run_episodes(
         gathered.append(global_information(step.points.cov))
         local.append(local_information(step.points.cov, near)[0])
         if each is not None:
-            each(t, look, step)
+            each(t, glance)
     # after the search the heads stay where they are
     still = moves[-1]._replace(seconds=0 * moves[-1].seconds, degrees=0 * moves[-1].degrees)
     moves += [still] * (saccades - len(moves))

@@ -22,6 +22,7 @@ from torchfovea.commands.shared.rollout import sample_of
 from torchfovea.commands.shared.settings import construct, whole
 from torchfovea.commands.shared.strategy import build_strategy
 from torchfovea.commands.shared.unread import refuse_unread
+from torchfovea.commands.shared.viewers import Show, check_viewer, viewers
 from torchfovea.files import write_csv, write_result
 from torchfovea.memory.egosphere import Memory
 from torchfovea.memory.store import save_memory
@@ -67,6 +68,7 @@ def run(cfg: DictConfig) -> float | None:
     folder, recording = run_folder(), open_recording(cfg)
     require(isinstance(cfg.skip, bool), "skip", cfg.skip, "true or false")
     require(isinstance(cfg.picture, bool), "picture", cfg.picture, "true or false")
+    watched = check_viewer(cfg)
     cfg = told_by(cfg, recording.calibration)
     observer = observer_of(build_observer(cfg), recording.calibration)
     matcher, strategy, saved = build_match(cfg), build_strategy(cfg, observer), memory_path(cfg, "memory.save")
@@ -82,7 +84,8 @@ def run(cfg: DictConfig) -> float | None:
 
     robot = Playback(recording, observer, matcher, sample_of(cfg), pass_over if cfg.skip else None)
     glances = search(robot, observer, memory, len(recording), generator, strategy)
-    done = _play(robot, observer, memory, glances, len(recording))
+    with viewers(cfg, folder, observer, "replay") as show:
+        done = _play(robot, observer, memory, glances, len(recording), show if watched else None)
 
     step = done.glance.step
     write_csv(folder / "fixations.csv", FIXATION_COLUMNS, done.rows)
@@ -139,7 +142,7 @@ def told_by(cfg: DictConfig, calibration: Calibration) -> DictConfig:
     return merged
 
 
-def _play(robot: Playback, observer: Observer, memory: Memory, glances: Any, count: int) -> Replayed:
+def _play(robot: Playback, observer: Observer, memory: Memory, glances: Any, count: int, show: Show | None) -> Replayed:
     """All frames, or those before the first that cannot be used.
 
     Raises:
@@ -158,6 +161,8 @@ def _play(robot: Playback, observer: Observer, memory: Memory, glances: Any, cou
                 colours = _colours(robot, observer, memory, colours, glance)
                 memory, last, look = glance.step.memory, glance, look if glance.look is None else glance
                 rows.append(_row(robot, glance, len(rows), time.process_time() - start))
+                if show is not None:
+                    show(len(rows) - 1, glance)
                 progress.update(task, advance=1)
                 start = time.process_time()
         except (SettingError, KeyboardInterrupt) as error:

@@ -28,12 +28,14 @@ from torchfovea.commands.shared.progress import progress_bar
 from torchfovea.commands.shared.rollout import batched, device_of, one_episode, roll_out, sample_of
 from torchfovea.commands.shared.settings import choice, number, whole
 from torchfovea.commands.shared.strategy import build_stop, build_strategy
-from torchfovea.episode import Episode
+from torchfovea.commands.shared.viewers import Show, check_viewer, viewers
+from torchfovea.episode import Each, Episode
 from torchfovea.files import write_csv
 from torchfovea.memory.store import save_memory
 from torchfovea.metrics import phantom
-from torchfovea.perception import Observer, Step
-from torchfovea.search import Look
+from torchfovea.perception import Observer
+from torchfovea.rows import row
+from torchfovea.search import Glance
 from torchfovea.setting import require
 
 __all__ = ["EPISODE_COLUMNS", "SACCADE_COLUMNS", "episode_row", "run", "saccade_rows", "summarize"]
@@ -62,6 +64,9 @@ def run(cfg: DictConfig) -> float:
     require(isinstance(cfg.picture, bool), "picture", cfg.picture, "true or false")
     require(isinstance(cfg.record, bool), "record", cfg.record, "true or false")
     require(not (cfg.record and cfg.fidelity == "geometric"), "record", True, "images, fidelity=photometric")
+    watched = check_viewer(cfg)
+    alone = not watched or workers_of(cfg)[0] == 1
+    require(alone, "workers", cfg.workers, "1 with viewer or video, which follow the last episode")
     # mistakes come first, also in what is not used
     build_strategy(cfg, observer), build_match(cfg), build_motor(cfg), build_route(cfg), loaded_memory(cfg, observer)
     saved = memory_path(cfg, "memory.save")
@@ -77,11 +82,14 @@ def run(cfg: DictConfig) -> float:
         def advance(count: int) -> None:
             progress.update(task, advance=count)
 
-        seeds = [seed + k for k in range(episodes)]
-        for k, row, course, episode in _episodes(cfg, observer, seeds, advance, _recordings(cfg, folder, episodes)):
-            last = episode
-            rows.append((k, seed + k, *row))
-            steps.extend((k, *line) for line in course)
+        seeds, recordings = [seed + k for k in range(episodes)], _recordings(cfg, folder, episodes)
+        with viewers(cfg, folder, observer, "episode") as show:
+            for k, figures, course, episode in _episodes(
+                cfg, observer, seeds, advance, recordings, show if watched else None
+            ):
+                last = episode
+                rows.append((k, seed + k, *figures))
+                steps.extend((k, *line) for line in course)
     write_csv(folder / "episodes.csv", EPISODE_COLUMNS, rows)
     write_csv(folder / "saccades.csv", SACCADE_COLUMNS, steps)
     assert last is not None
@@ -89,10 +97,10 @@ def run(cfg: DictConfig) -> float:
         _draw(folder, cfg, observer.retina, last, rows[-1])
     if saved is not None:
         save_memory(saved, last.step.memory)
-    figures = summarize(rows)
-    complete(folder, figures)
-    _print(figures)
-    return float(figures["gap_per_saccade"])
+    summary = summarize(rows)
+    complete(folder, summary)
+    _print(summary)
+    return float(summary["gap_per_saccade"])
 
 
 Outcome = tuple[int, tuple[Any, ...], list[tuple[Any, ...]], Episode | None]
@@ -113,6 +121,7 @@ def _episodes(
     seeds: list[int],
     advance: Callable[[int], None],
     recordings: list[str | None],
+    show: Show | None,
 ) -> Iterator[Outcome]:
     """Number, figures and course of every episode in order; the last one's episode itself besides."""
     (workers, backend), final = workers_of(cfg), len(seeds) - 1
@@ -120,13 +129,14 @@ def _episodes(
         size = whole(cfg, "batch")
         for start in range(0, len(seeds), size):
             part = seeds[start : start + size]
-            together = roll_out(cfg, observer, part, each=_each(advance, len(part)))
+            last = show if start + len(part) > final else None
+            together = roll_out(cfg, observer, part, each=_each(advance, len(part), last))
             for k, episode in enumerate(together, start):
                 yield k, episode_row(episode), saccade_rows(episode), episode if k == final else None
         return
     if workers == 1 or final == 0:
         for k, seed in enumerate(seeds):
-            episode = one_episode(cfg, observer, seed, _each(advance, 1), recordings[k])
+            episode = one_episode(cfg, observer, seed, _each(advance, 1, show if k == final else None), recordings[k])
             yield k, episode_row(episode), saccade_rows(episode), episode if k == final else None
         return
     settings = OmegaConf.to_yaml(OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"]), resolve=True)
@@ -140,9 +150,16 @@ def _episodes(
     yield from (outcomes[k] for k in range(len(seeds)))
 
 
-def _each(advance: Callable[[int], None], count: int) -> Callable[[int, Look, Step], None]:
-    """What an episode calls after every decision: so many saccades are done."""
-    return lambda t, look, step: advance(count)
+def _each(advance: Callable[[int], None], count: int, show: Show | None = None) -> Each:
+    """What episodes call after every decision: so many saccades are done, and the last episode's is shown."""
+
+    def each(t: int, glance: Glance) -> None:
+        advance(count)
+        if show is not None:
+            single = glance._replace(step=glance.step._replace(state=None))
+            show(t, row(single, len(glance.looked) - 1) if glance.looked.dim() else single)
+
+    return each
 
 
 def _elsewhere(work: tuple[str, int, int, bool, str | None]) -> Outcome:

@@ -47,6 +47,7 @@ EXTRAS = {
     "gymnasium": "rl",
     "stable_baselines3": "ppo",
     "onnxruntime": "onnx",
+    "rerun": "rerun",
 }
 
 # settings that are gone, and what does their work

@@ -1,7 +1,8 @@
-"""Parts of pictures that several commands draw."""
+"""Pictures, and parts of pictures, that several commands draw."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import matplotlib
@@ -9,15 +10,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchfovea.metrics import information
+from torchfovea.search import Glance
 from torchfovea.sensing.correspondence import Disparity
 from torchfovea.sensing.layout import Retina
-from torchfovea.sensing.retina import reconstruct
+from torchfovea.sensing.retina import fovea, reconstruct
 from torchfovea.stereo.sweep import SweepRange
 
 matplotlib.use("Agg")
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-__all__ = ["found_map", "sphere_map"]
+__all__ = ["draw_glance", "found_map", "sphere_map"]
 
 
 def found_map(found: Disparity | SweepRange, retina: Retina | None, size_px: int) -> tuple[np.ndarray, str]:
@@ -52,3 +56,50 @@ def sphere_map(
     axes.set_aspect("equal")
     axes.figure.colorbar(drawn, ax=axes, label=label, pad=0.015)
     return drawn
+
+
+def draw_glance(glance: Glance, path: Tensor, nats: Sequence[float], retina: Retina, head_line: str) -> Figure:
+    """One frame of a search: what the eyes see, what is known then, where the head looks next.
+
+    Args:
+        glance: of one robot.
+        path: (T, 3), directions in E of the fixations until now.
+        nats: the mean information after each of them.
+        retina: of both eyes.
+        head_line: the title.
+    """
+    shown = glance.look.pictures if glance.look is not None else None
+    figure = Figure(figsize=(12, 8.2 if shown is not None else 4.6), layout="constrained")
+    figure.suptitle(head_line)
+    parts = figure.subfigures(2, 1, squeeze=False)[:, 0] if shown is not None else [figure]
+    if shown is not None:
+        left, right = (image.detach().cpu().float() for image in (shown.left, shown.right))
+        kept = reconstruct(fovea(left[None], None, retina), retina, (left.shape[-2], left.shape[-1]))[0][0]
+        row = parts[0].subplots(1, 3)
+        names = "left eye", "right eye", "what the left retina keeps"
+        for axes, image, name in zip(row, (left, right, kept), names, strict=True):
+            axes.imshow(np.asarray(image.movedim(0, -1)).clip(0, 1))
+            axes.plot((image.shape[-1] - 1) / 2, (image.shape[-2] - 1) / 2, "+", color="white", ms=12, mew=2)
+            axes.set_title(name)
+            axes.set_axis_off()
+    memory, points = glance.step.memory, glance.step.points
+    wide = parts[-1].subplots(1, 3, width_ratios=(1, 1, 0.7))
+    distance = torch.where(memory.looks > 0, points.mean.norm(dim=-1), torch.nan)
+    sphere_map(wide[0], memory.cells, distance.cpu(), "range [m]", "viridis_r", (0.4, 4.0))
+    known = information(points.cov).cpu()
+    low, high = (float(q) for q in torch.quantile(known.double(), known.new_tensor([0.02, 0.98]).double()))
+    sphere_map(wide[1], memory.cells, known, "information [nats]", "magma", (low, max(high, low + 1e-3)))
+    for axes, name in zip(wide, ("range of the seen cells", "information"), strict=False):
+        axes.set_title(name)
+        axes.set_facecolor("0.9")
+        azimuth, elevation = torch.rad2deg(torch.atan2(path[:, 1], path[:, 0])), torch.rad2deg(torch.asin(path[:, 2]))
+        axes.plot(azimuth, elevation, ".-", color="white", lw=2.4, ms=8)
+        axes.plot(azimuth, elevation, ".-", color="0.15", lw=1, ms=5)
+        if int(glance.step.cell) >= 0:
+            x, y, z = memory.cells[glance.step.cell].tolist()
+            place = np.degrees([np.arctan2(y, x), np.arcsin(z)])
+            axes.plot(*place, "o", mfc="none", mec="tab:orange", ms=13, mew=2.2)
+    wide[2].plot(range(1, len(nats) + 1), nats, ".-", color="tab:purple")
+    wide[2].set(xlabel="fixation", ylabel="mean information [nats]")
+    wide[2].grid(alpha=0.3)
+    return figure

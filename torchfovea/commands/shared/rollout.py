@@ -16,11 +16,10 @@ from torchfovea.commands.shared.memories import loaded_memory
 from torchfovea.commands.shared.settings import choice, number, whole
 from torchfovea.commands.shared.strategy import build_stop, build_strategy
 from torchfovea.deciding.strategies import Strategy
-from torchfovea.episode import Episode, Rules, run_episode, run_episodes
+from torchfovea.episode import Each, Episode, Rules, run_episode, run_episodes
 from torchfovea.memory.egosphere import Memory
-from torchfovea.perception import Observer, Step, new_memory
+from torchfovea.perception import Observer, new_memory
 from torchfovea.rows import stack
-from torchfovea.search import Look
 from torchfovea.sensing.head import Head
 from torchfovea.setting import require
 from torchfovea.sim.arenas import GeometricArenas
@@ -59,7 +58,7 @@ def one_episode(
     cfg: DictConfig,
     observer: Observer,
     seed: int,
-    each: Callable[[int, Look, Step], None] | None = None,
+    each: Each | None = None,
     record: str | None = None,
 ) -> Episode:
     """The episode of one seed, with whatever sensor, renderer and motor; recorded in a folder if one is given."""
@@ -135,7 +134,7 @@ def roll_out(
     observer: Observer,
     seeds: Sequence[int],
     strategy: StrategyFor | None = None,
-    each: Callable[[int, Any, Any], None] | None = None,
+    each: Each | None = None,
 ) -> list[Episode]:
     """Episodes of several seeds (a seed may come more than once) together, by the geometric sensor.
 
