@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from torchfovea.cli import main
-from torchfovea.commands.memory.study import judge_cells
 from torchfovea.commands.shared.config import conf_dir
+from torchfovea.commands.shared.judge import judge_cells
 from torchfovea.memory.sphere import fibonacci_directions
 from torchfovea.memory.store import load_memory
 from torchfovea.sim.scene import Cans, build_scene

@@ -94,6 +94,12 @@ COMMANDS: dict[str, Command] = {
         "how long the hot paths take, beside the peers that one would pick",
         "torchfovea bench profile=quick",
     ),
+    "benchmark": Command(
+        "torchfovea.commands.benchmark.command:run",
+        "policies, matchers, memories and whole systems on the same scenes, and a leaderboard",
+        "torchfovea benchmark profile=quick",
+        resumes=True,
+    ),
     "doctor": Command("torchfovea.commands.doctor:run", "what this machine can render and has", "torchfovea doctor"),
 }
 

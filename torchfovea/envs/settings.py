@@ -5,14 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from functools import lru_cache
 from typing import Any
 
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
 
-from torchfovea.commands.shared.config import conf_dir
+from torchfovea.commands.shared.composed import compose_search
 from torchfovea.setting import require
 
 __all__ = ["ACTIONS", "FIDELITIES", "OBSERVATIONS", "EnvSettings", "env_settings", "search_settings"]
@@ -95,12 +92,8 @@ def env_settings(given: dict[str, Any]) -> EnvSettings:
     return EnvSettings(**plain)
 
 
-@lru_cache(maxsize=32)
 def search_settings(overrides: tuple[str, ...], fidelity: str) -> DictConfig:
     """The configuration of the search that an environment is."""
     sensed = "photometric" if fidelity == "photometric" else "geometric"
     chosen = [*SIZES, *overrides, f"fidelity={sensed}"]
-    if GlobalHydra.instance().is_initialized():  # inside a command's own job
-        return compose("search", overrides=chosen)
-    with initialize_config_dir(conf_dir(), version_base="1.3"):
-        return compose("search", overrides=chosen)
+    return compose_search(tuple(chosen))

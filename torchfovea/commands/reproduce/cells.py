@@ -6,17 +6,14 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from torchfovea.commands.shared.build import build_observer, whole
-from torchfovea.commands.shared.config import conf_dir
+from torchfovea.commands.shared.composed import compose_search
 from torchfovea.commands.shared.rollout import batched, one_episode, roll_out
 from torchfovea.deciding.strategies import upper_confidence_bound
 from torchfovea.episode import Episode
@@ -145,32 +142,14 @@ def _parts(seeds: Sequence[int], size: int) -> list[Sequence[int]]:
     return [seeds[start : start + size] for start in range(0, len(seeds), size)]
 
 
-def config_folders() -> tuple[str, ...]:
-    """The folders of configurations that a user added to the running command's, as `hydra.searchpath` takes them."""
-    if not HydraConfig.initialized():
-        return ()
-    sources = HydraConfig.get().runtime.config_sources
-    return tuple(f"{s.schema}://{s.path}" for s in sources if s.provider not in ("hydra", "main", "schema"))
-
-
-@lru_cache(maxsize=64)
-def _search(overrides: tuple[str, ...], folders: tuple[str, ...]) -> DictConfig:
-    """The configuration of `torchfovea search` with these settings."""
-    if GlobalHydra.instance().is_initialized():  # inside a command's own job
-        return compose("search", overrides=list(overrides))
-    places = [f"hydra.searchpath=[{','.join(folders)}]"] if folders else []
-    with initialize_config_dir(conf_dir(), version_base="1.3"):
-        return compose("search", overrides=[*overrides, *places])
-
-
 def run_task(task: CellTask, folders: tuple[str, ...] = ()) -> list[dict[str, Any]]:
     """A row for each of a task's episodes: labels, arm, seed, metrics, and the course where it is kept.
 
     Args:
         task: what to run.
-        folders: of configurations beside ours, see `config_folders`.
+        folders: of configurations beside ours, see `torchfovea.commands.shared.composed.config_folders`.
     """
-    cfg = _search((*task.overrides, *task.arm), folders)
+    cfg = compose_search((*task.overrides, *task.arm), folders)
     observer = build_observer(cfg)
     whole(cfg, "saccades")
     if not batched(cfg):

@@ -13,11 +13,12 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
 
-from torchfovea.commands.reproduce.cells import METRICS, CellTask, cells_of, config_folders, run_task, task_name
+from torchfovea.commands.reproduce.cells import METRICS, CellTask, cells_of, run_task, task_name
 from torchfovea.commands.reproduce.claims import Claim, Verdict, judge_claims, read_claims, rows_where
 from torchfovea.commands.reproduce.fig5 import judge_fig5
 from torchfovea.commands.reproduce.report import write_report
 from torchfovea.commands.shared.build import whole
+from torchfovea.commands.shared.composed import config_folders
 from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.manifest import complete, finished
 from torchfovea.commands.shared.mistakes import describe

@@ -21,6 +21,7 @@ from torchfovea.commands.shared.build import (
     name_of,
 )
 from torchfovea.commands.shared.config import run_folder
+from torchfovea.commands.shared.figures import EPISODE_COLUMNS, episode_row
 from torchfovea.commands.shared.manifest import complete, finished
 from torchfovea.commands.shared.memories import loaded_memory, memory_path
 from torchfovea.commands.shared.parallel import spread, workers_of
@@ -38,13 +39,8 @@ from torchfovea.rows import row
 from torchfovea.search import Glance
 from torchfovea.setting import require
 
-__all__ = ["EPISODE_COLUMNS", "SACCADE_COLUMNS", "episode_row", "run", "saccade_rows", "summarize"]
+__all__ = ["SACCADE_COLUMNS", "run", "saccade_rows", "summarize"]
 
-EPISODE_COLUMNS = (
-    "episode", "seed", "gap_final", "gap_per_saccade", "regret_per_saccade", "global_information_per_saccade",
-    "local_information_per_saccade", "saccades_to_target", "found", "target_error_m", "degrees_travelled",
-    "motor_seconds", "seconds_per_saccade", "phantom_share",
-)  # fmt: skip
 SACCADE_COLUMNS = (
     "episode", "saccade", "pan_rad", "tilt_rad", "vergence_rad", "range_m", "reward", "gap", "regret",
     "global_information", "local_information", "aimed_m", "phantom",
@@ -169,18 +165,6 @@ def _elsewhere(work: tuple[str, int, int, bool, str | None]) -> Outcome:
     assert isinstance(cfg, DictConfig)
     episode = one_episode(cfg, build_observer(cfg), seed, record=record)
     return k, episode_row(episode), saccade_rows(episode), episode if kept else None
-
-
-def episode_row(episode: Episode) -> tuple[Any, ...]:
-    """An episode's figures, in the order of EPISODE_COLUMNS from gap_final on."""
-    local = episode.local_information
-    chosen = phantom(episode.aimed_m, episode.range_m)[1 : episode.looks]  # the first gaze is nobody's choice
-    return (
-        float(episode.gap[-1]), float(episode.gap.mean()), float(episode.regret.mean()),
-        float(episode.global_information.mean()), None if local is None else float(local.mean()),
-        episode.moves, int(episode.hit.any()), episode.target_error_m, episode.degrees, episode.motor_seconds,
-        episode.compute_seconds, float(chosen.double().mean()) if len(chosen) else None,
-    )  # fmt: skip
 
 
 def saccade_rows(episode: Episode) -> list[tuple[Any, ...]]:

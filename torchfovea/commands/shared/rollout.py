@@ -60,8 +60,18 @@ def one_episode(
     seed: int,
     each: Each | None = None,
     record: str | None = None,
+    strategy: Strategy | None = None,
 ) -> Episode:
-    """The episode of one seed, with whatever sensor, renderer and motor; recorded in a folder if one is given."""
+    """The episode of one seed, with whatever sensor, renderer and motor.
+
+    Args:
+        cfg: a search's.
+        observer: of that configuration.
+        seed: of scene, cells and noise.
+        each: see `torchfovea.episode.run_episodes`.
+        record: a folder for it, if one is given.
+        strategy: in place of the configuration's own.
+    """
     generator = torch.Generator().manual_seed(seed)
     arena = build_arena(cfg, observer, seed)
     if record is not None:
@@ -70,7 +80,7 @@ def one_episode(
     if memory is None:
         memory = new_memory(observer, build_cells(_aimed(cfg, arena.world.scene), observer.head, generator))
     truth = arena.truth(memory.cells)
-    rules = _rules(cfg, build_strategy(cfg, observer, _aim(truth)))
+    rules = _rules(cfg, build_strategy(cfg, observer, _aim(truth)) if strategy is None else strategy)
     return run_episode(observer, memory, arena, truth, generator, rules, each)
 
 

@@ -1,0 +1,1 @@
+"""`torchfovea benchmark`: policies, matchers, memories and whole systems under one frozen protocol."""
