@@ -14,6 +14,7 @@ from torchfovea.sim.compile import stand_at
 from torchfovea.sim.gl import opengl
 from torchfovea.sim.model import EgoPose, Scene
 from torchfovea.sim.motor import InstantMotor, Motor, Moved
+from torchfovea.sim.noise import ImageNoise, expose
 from torchfovea.sim.rays import Frame, RayHits, Renderer, cast, render
 from torchfovea.sim.servo import ServoMotor
 
@@ -64,6 +65,8 @@ class World:
         camera: of the retinas, in retinal pixels; 90 degrees over 100 px by default.
         source_px: side of the pictures.
         radius_px: of the retina, which the pictures span.
+        noise: of the pictures; None: a repeated gaze is the same picture.
+        seed: of that noise.
 
     Raises:
         SettingError: a setting that cannot be.
@@ -78,6 +81,8 @@ class World:
         camera: Camera | None = None,
         source_px: int = 400,
         radius_px: float = 100.0,
+        noise: ImageNoise | None = None,
+        seed: int = 0,
     ) -> None:
         require(head is None or head == scene.head, "head", head, "the head that the scene was built for")
         drawn = callable(renderer) or renderer in ("rays", "gl")
@@ -100,11 +105,13 @@ class World:
             require(moves, "motor", motor, "instant, physics or a motor that has move(head, before, command)")
             assert not isinstance(motor, str)
             self.motor = motor
-        zero = torch.zeros((), dtype=torch.float64)
-        self.gaze = Gaze(zero, zero, zero)
+        self.noise, self._seed = noise, seed
+        self.reset()
 
     def reset(self) -> None:
-        """Look straight ahead, in no time."""
+        """Look straight ahead, in no time; the pictures' noise begins anew."""
+        self._chance = torch.Generator().manual_seed(self._seed)
+        self._gains = (1.0, 1.0) if self.noise is None else self.noise.gains(self._chance)
         zero = torch.zeros((), dtype=torch.float64)
         self.gaze = Gaze(zero, zero, zero)
 
@@ -135,6 +142,12 @@ class World:
             require(isinstance(frame, Frame), "renderer", type(frame).__name__, "a torchfovea.sim.rays.Frame")
             shape = (3, self.source_px, self.source_px)
             require(tuple(frame.image.shape) == shape, "renderer's image", tuple(frame.image.shape), str(shape))
+        if self.noise is None:
+            return left, right
+        left, right = (
+            frame._replace(image=expose(frame.image, self.noise, gain, self._chance))
+            for frame, gain in zip((left, right), self._gains, strict=True)
+        )
         return left, right
 
     def fixated(self, gaze: Gaze | None = None) -> Fixated:

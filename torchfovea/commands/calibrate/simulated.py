@@ -9,7 +9,14 @@ import torch
 from omegaconf import DictConfig
 
 from torchfovea.commands.calibrate.truths import Truths, look_at_world
-from torchfovea.commands.shared.build import build_head, build_matcher, build_renderer, build_scene_of, build_sensor
+from torchfovea.commands.shared.build import (
+    build_head,
+    build_matcher,
+    build_noise,
+    build_renderer,
+    build_scene_of,
+    build_sensor,
+)
 from torchfovea.commands.shared.parallel import spread, workers_of
 from torchfovea.commands.shared.progress import progress_bar
 from torchfovea.sensing.correspondence import Budget
@@ -68,6 +75,8 @@ def looks_at(task: SceneTask) -> list[Truths]:
         camera=camera,
         source_px=task.budget.source_px or sized.sensor.source_px,
         radius_px=retina.radius_px,
+        noise=build_noise(sized),
+        seed=task.seed,
     )
     gazes = random_gazes(scene, world, task.looks, torch.Generator().manual_seed(task.seed))
     matcher = build_matcher(sized)

@@ -15,6 +15,7 @@ from rich.table import Table
 from torchfovea.commands.shared.build import (
     build_match,
     build_motor,
+    build_noise,
     build_observer,
     build_renderer,
     build_route,
@@ -64,7 +65,8 @@ def run(cfg: DictConfig) -> float:
     alone = not watched or workers_of(cfg)[0] == 1
     require(alone, "workers", cfg.workers, "1 with viewer or video, which follow the last episode")
     # mistakes come first, also in what is not used
-    build_strategy(cfg, observer), build_match(cfg), build_motor(cfg), build_route(cfg), loaded_memory(cfg, observer)
+    build_strategy(cfg, observer), build_match(cfg), build_motor(cfg), build_route(cfg), build_noise(cfg)
+    loaded_memory(cfg, observer)
     saved = memory_path(cfg, "memory.save")
     done = finished(cfg, folder)
     if done is not None:

@@ -25,6 +25,7 @@ from torchfovea.sensing.unscented import SigmaPoints
 from torchfovea.setting import SettingError, require
 from torchfovea.sim.arena import SimulatedArena
 from torchfovea.sim.motor import Motor
+from torchfovea.sim.noise import ImageNoise
 from torchfovea.sim.rays import Renderer
 from torchfovea.sim.scene import Room, Scene, build_scene
 from torchfovea.sim.walk import Route
@@ -42,6 +43,7 @@ __all__ = [
     "build_match",
     "build_matcher",
     "build_motor",
+    "build_noise",
     "build_observer",
     "build_renderer",
     "build_route",
@@ -164,6 +166,15 @@ def build_renderer(cfg: DictConfig) -> Renderer:
     return renderer
 
 
+def build_noise(cfg: DictConfig) -> ImageNoise | None:
+    """What the rendered pictures suffer from; None where a configuration asks for none."""
+    node = OmegaConf.select(cfg, "noise")
+    if node is None:
+        return None
+    require(isinstance(node, DictConfig), "noise", node, "photons, read and exposure; null: none")
+    return construct(ImageNoise, node, "noise")
+
+
 def build_motor(cfg: DictConfig) -> Callable[[Scene], Motor]:
     """What turns the head of a scene."""
     name_of(cfg, "motor")
@@ -192,6 +203,8 @@ def build_arena(cfg: DictConfig, observer: Observer, seed: int) -> SimulatedAren
         camera=observer.camera,
         source_px=whole(cfg, "sensor.source_px", 16),
         radius_px=observer.retina.radius_px,
+        noise=build_noise(cfg),
+        seed=seed,
     )
     match = build_match(cfg)  # checked even where it is not used
     sample = None if OmegaConf.select(cfg, "sensor.sample") is None else whole(cfg, "sensor.sample", 16)
