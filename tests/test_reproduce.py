@@ -14,6 +14,7 @@ from omegaconf import OmegaConf
 from torchfovea.cli import main
 from torchfovea.commands.reproduce import cells
 from torchfovea.commands.reproduce.claims import Claim, judge_claims, read_claims
+from torchfovea.commands.reproduce.report import decidable, shown
 from torchfovea.commands.shared.config import conf_dir
 from torchfovea.setting import SettingError
 
@@ -88,6 +89,53 @@ def test_picks_and_thresholds():
     assert below.verdict == "holds" and below.estimate == pytest.approx(-0.2, abs=0.1)
 
 
+def test_a_claim_about_the_best_is_as_sure_as_its_least_sure_contrast():
+    """Two rivals of one mean: whoever happens to lead, picking it and testing it would favour the claim's denial."""
+    rows = rows_of({"a": noisy(0.8), "b": noisy(0.5, seed=1), "c": noisy(0.72, seed=2)})
+    each = [judge_claims([claim(minus={"arm": other})], rows)[0] for other in "bc"]
+    both = judge_claims([claim(minus={"arm": ["b", "c"]}, minus_pick="highest")], rows)[0]
+    assert both.p_value == max(one.p_value for one in each) and both.estimate == each[1].estimate
+    # one rival that is better denies it, at the price of having looked at two
+    rows = rows_of({"a": noisy(0.8), "b": noisy(0.5, seed=1), "c": noisy(1.1, seed=2)})
+    denied = judge_claims([claim(minus={"arm": ["b", "c"]}, minus_pick="highest")], rows)[0]
+    worse = judge_claims([claim(minus={"arm": "c"})], rows)[0]
+    assert denied.verdict == "fails" and denied.p_value == pytest.approx(2 * worse.p_value)
+    below = claim(plus={"arm": ["a", "b"]}, plus_pick="highest", minus=None, threshold=1.0, sign="less")
+    assert judge_claims([below], rows)[0].verdict == "holds"
+
+
+def test_every_arm_is_compared_with_itself():
+    rows = [
+        {"arm": arm, "bias": "unbiased", "seed": seed, "fov_deg": fov, "gap_per_saccade": value + shift * (fov == 135)}
+        for arm, shift in (("a", 0.5), ("b", 0.3))
+        for fov in (90, 135)
+        for seed, value in enumerate(noisy(0.2, seed=fov))
+    ]
+    settings = {"plus": {"fov_deg": 135}, "minus": {"fov_deg": 90}, "arms": True}
+    found = judge_claims([claim(**settings)], rows)[0]
+    assert found.verdict == "holds" and found.n == 20
+    alone = judge_claims([claim(**{**settings, "arms": False, "plus": {"fov_deg": 135, "arm": "b"},
+                                   "minus": {"fov_deg": 90, "arm": "b"}})], rows)[0]  # fmt: skip
+    assert found.estimate == pytest.approx(alone.estimate)
+
+
+def test_a_difference_below_the_margin_does_not_count():
+    rows = rows_of({"a": noisy(0.80), "b": [v - 0.02 for v in noisy(0.80)]})
+    assert judge_claims([claim()], rows)[0].verdict == "holds"
+    found = judge_claims([claim(margin=0.05)], rows)[0]
+    assert found.verdict == "fails" and found.estimate == pytest.approx(0.02)
+    assert "is greater than 0.05" in claim(margin=0.05).definition
+    assert "is less than -0.05" in claim(margin=0.05, sign="less").definition
+
+
+def test_what_so_many_scenes_can_decide_is_said():
+    assert "no claim can be decided" in decidable(5, 21) and "no claim" not in decidable(10, 21)
+    assert shown({"id": "fig5_uniform", "estimate": 0.312}) == "31%"
+    with initialize_config_dir(conf_dir(), version_base="1.3"):
+        cfg = compose("reproduce", overrides=["profile=quick"], return_hydra_config=True)
+    assert cfg.profiles.quick.episodes >= 10
+
+
 def test_a_missing_local_information_is_left_out():
     rows = rows_of({"a": noisy(1.0), "b": noisy(0.5)})
     rows[0]["gap_per_saccade"] = None
@@ -100,6 +148,7 @@ def test_a_missing_local_information_is_left_out():
         ({"sign": "bigger"}, "claims.c.sign = bigger"),
         ({"plus_pick": "best"}, "claims.c.plus_pick = best"),
         ({"sign": "equal"}, "claims.c.margin"),
+        ({"arms": True, "minus_pick": "highest"}, "claims.c.arms"),
     ],
 )
 def test_claims_that_cannot_be_judged(changes, message):

@@ -73,6 +73,37 @@ def test_sign_flips():
     assert sg.sign_flip_p_value(torch.full((40,), 0.1), generator()).item() == pytest.approx(1 / 10000)
 
 
+def test_the_studentized_bootstrap_against_a_loop():
+    few = np.random.default_rng(5).gamma(1.0, size=12) - 0.4
+    drawn = torch.randint(12, (999, 12), generator=generator(4)).numpy()
+    t, beyond = few.mean() / few.std(ddof=1), [0, 0]
+    for index in drawn:
+        again = (few[index].mean() - few.mean()) / few[index].std(ddof=1)
+        beyond = [beyond[0] + (again <= t), beyond[1] + (again >= t)]
+    ours = sg.studentized_p_value(torch.from_numpy(few), generator(4), 999)
+    assert float(ours) == pytest.approx(2 * (1 + min(beyond)) / 1000)
+    normal = torch.randn(40, generator=generator(2), dtype=torch.float64) + 0.3
+    theirs = stats.ttest_1samp(normal.numpy(), 0).pvalue
+    assert float(sg.studentized_p_value(normal, generator())) == pytest.approx(theirs, abs=0.03)
+    assert float(sg.studentized_p_value(torch.zeros(5), generator())) == 1
+    assert float(sg.studentized_p_value(torch.full((8,), 0.2), generator(), 999)) == pytest.approx(2 / 1000)
+    for bad in (torch.zeros(1), torch.zeros(3, 2), torch.tensor([0.0, math.nan])):
+        with pytest.raises(SettingError):
+            sg.studentized_p_value(bad, generator())
+
+
+def test_skewed_differences_reject_less_often_by_the_larger_of_both():
+    """Of lognormal differences of mean 0 the sign flip rejects far more than its level."""
+    size = {"flip": 0, "both": 0}
+    for k in range(250):
+        x = torch.exp(1.2 * torch.randn(20, generator=generator(k), dtype=torch.float64)) - math.exp(0.72)
+        flip = float(sg.sign_flip_p_value(x, generator(k), 499))
+        both = max(flip, float(sg.studentized_p_value(x, generator(k), 499)))
+        size["flip"] += flip <= 0.05
+        size["both"] += both <= 0.05
+    assert size["flip"] / 250 > 0.09 and size["both"] < 0.8 * size["flip"]
+
+
 def test_holm():
     assert sg.holm(torch.tensor([0.01, 0.04, 0.03, 0.005]).double()).tolist() == pytest.approx([0.03, 0.06, 0.06, 0.02])
     assert sg.holm(torch.tensor([0.9, 0.8])).tolist() == [1.0, 1.0]

@@ -16,7 +16,7 @@ from rich.table import Table
 from torchfovea.commands.reproduce.cells import METRICS, CellTask, cells_of, run_task, task_name
 from torchfovea.commands.reproduce.claims import Claim, Verdict, judge_claims, read_claims, rows_where
 from torchfovea.commands.reproduce.fig5 import judge_fig5
-from torchfovea.commands.reproduce.report import write_report
+from torchfovea.commands.reproduce.report import decidable, shown, write_report
 from torchfovea.commands.shared.build import whole
 from torchfovea.commands.shared.composed import config_folders
 from torchfovea.commands.shared.config import run_folder
@@ -70,7 +70,7 @@ def run(cfg: DictConfig) -> float:
 
 
 def _stated(claim: Claim, verdict: Verdict) -> Row:
-    head = {key: getattr(claim, key) for key in ("id", "section", "text", "definition")}
+    head = {key: getattr(claim, key) for key in ("id", "section", "text", "definition", "note")}
     return {**head, **asdict(verdict), "metric": claim.metric}
 
 
@@ -143,7 +143,9 @@ def _print(stated: list[Row]) -> None:
         table.add_column(column)
     for entry in stated:
         low, high = entry["ci_low"], entry["ci_high"]
-        estimate = "-" if entry["estimate"] is None else f"{entry['estimate']:.3g}"
-        interval = "-" if low is None else f"{low:.3g} to {high:.3g}"
+        estimate, interval = shown(entry), "-" if low is None else f"{low:.3g} to {high:.3g}"
         table.add_row(entry["id"], entry["verdict"], estimate, interval, str(entry["n"]))
     Console().print(table)
+    known = [entry["n"] for entry in stated if entry["p_value"] is not None]
+    if known:
+        Console().print(decidable(max(known), len(known)), soft_wrap=True)

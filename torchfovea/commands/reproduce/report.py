@@ -16,7 +16,7 @@ from torchfovea.commands.reproduce.claims import rows_where
 from torchfovea.files import replacing, write_csv
 from torchfovea.studies.significance import bootstrap_interval
 
-__all__ = ["write_report"]
+__all__ = ["decidable", "shown", "write_report"]
 
 Row = dict[str, Any]
 
@@ -53,7 +53,11 @@ def write_report(folder: Path, plain: Row, rows: list[Row], stated: list[Row], f
         f"What counts was fixed before the run: scene "
         f"{plain['counts']['scene']}, reading {plain['counts']['reading']}. "
         "The scene is the unit of statistics; differences are paired over scenes; intervals are bootstrapped (BCa); "
-        f"verdicts are two-sided at {1 - plain['level']:.0%} after Holm's correction over the claims of Sec. 7.2. "
+        f"verdicts are two-sided at {1 - plain['level']:.0%} after Holm's correction over the claims of Sec. 7.2, by "
+        "the larger p of a sign flip and a studentized bootstrap; a claim about the best or worst of several is one "
+        f"about every one of them (intersection-union). {_what_can(stated)} reading=printed has the paper's chart, "
+        "fusion, reward, prior and error budget; the gate's least width (fusion.gate_spacing), what a cell without an "
+        "observation takes (fusion.fill) and which cells may be fixated (eligibility) are ours there too. "
         "In attention_world all scenes are one place, and only the noise and the memory's cells differ.</p>",
         _claims_table(stated),
     ]
@@ -65,9 +69,29 @@ def write_report(folder: Path, plain: Row, rows: list[Row], stated: list[Row], f
         temporary.write_text("\n".join(parts), encoding="utf-8")
 
 
+def decidable(scenes: int, claims: int) -> str:
+    """What so many scenes can decide at all: of signs that all agree, p is 2^(1 − scenes), times the claims."""
+    least = min(1.0, claims * 2.0 ** (1 - scenes))
+    if least > 0.05:
+        return f"With {scenes} scenes no claim can be decided: p is at least {least:.2g} after Holm's correction."
+    return f"With {scenes} scenes the smallest p after Holm's correction is {least:.1g}."
+
+
+def shown(entry: Row) -> str:
+    """A claim's estimate in words: a share as a share."""
+    if entry["estimate"] is None:
+        return "-"
+    return f"{entry['estimate']:.0%}" if entry["id"] == "fig5_uniform" else f"{entry['estimate']:.3g}"
+
+
 def _inline(picture: Path) -> str:
     data = base64.b64encode(picture.read_bytes()).decode()
     return f'<p><img alt="{html.escape(picture.stem)}" src="data:image/png;base64,{data}"></p>'
+
+
+def _what_can(stated: list[Row]) -> str:
+    known = [entry["n"] for entry in stated if entry["p_value"] is not None]
+    return decidable(max(known), len(known)) if known else ""
 
 
 def _number(value: Any) -> str:
@@ -80,10 +104,11 @@ def _claims_table(stated: list[Row]) -> str:
         interval = "" if entry["ci_low"] is None else f"<br>{_number(entry['ci_low'])} to {_number(entry['ci_high'])}"
         places = [f"{place}: {verdict}" for place, verdict in entry.get("elsewhere", {}).items() if verdict]
         other = f"<br><small>elsewhere: {html.escape('; '.join(places))}</small>" if places else ""
+        note = f". {entry['note']}" if entry.get("note") else ""
         lines.append(
             f"<tr><td>{html.escape(entry['text'])} <small>(Sec. {entry['section']}, {entry['id']})</small>"
-            f"<br><small>{html.escape(entry['definition'])}</small>{other}"
-            f"<td class={entry['verdict']}>{entry['verdict']}<td class=n>{_number(entry['estimate'])}{interval}"
+            f"<br><small>{html.escape(entry['definition'])}{html.escape(note)}</small>{other}"
+            f"<td class={entry['verdict']}>{entry['verdict']}<td class=n>{shown(entry)}{interval}"
             f"<td class=n>{_number(entry['effect_size'])}<td class=n>{_number(entry['p_holm'])}<td class=n>{entry['n']}"
         )
     return "\n".join([*lines, "</table>"])
