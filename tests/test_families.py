@@ -7,8 +7,10 @@ from hydra import compose, initialize_config_dir
 from torchfovea.cli import main
 from torchfovea.commands.shared.build import build_observer, build_scene_of
 from torchfovea.commands.shared.config import conf_dir
+from torchfovea.commands.tune.command import build_problem
 from torchfovea.perception import Eligibility, Observer, decide, new_memory
 from torchfovea.sensing.head import Head
+from torchfovea.tuning.scenes import draw_scenes, stream
 
 FAMILIES = ["narrow", "small", "far", "twins", "marked"]
 
@@ -65,3 +67,14 @@ def test_a_noisy_floor_is_no_object():
         )
         share[sigmas] = float(decide(observer, seen).eligible.float().mean())
     assert share[0.0] > 0.15 and share[3.0] < 0.01
+
+
+@pytest.mark.parametrize("name", ["small", "far"])
+def test_a_family_has_a_distribution_to_tune_on(name):
+    with initialize_config_dir(conf_dir(), version_base="1.3"):
+        cfg = compose("tune", overrides=[f"distribution={name}", "head=human"])
+    problem = build_problem(cfg)
+    scenes = draw_scenes(problem.distribution, problem.task.observer.head, 8, stream("training", 0))
+    low, high = problem.distribution.target_range_m
+    assert ((scenes.nearest_m > low - 0.1) & (scenes.nearest_m < high)).all()
+    assert scenes.x.shape == (8, problem.distribution.cans)
