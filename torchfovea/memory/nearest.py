@@ -13,6 +13,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from torchfovea.gaussian import columns
 from torchfovea.memory.cell_index import SLOTS, CellIndex, build_index, unit_cells
 from torchfovea.setting import require
 
@@ -203,8 +204,8 @@ def nearest_observation(
         x, y, z = x / largest, y / largest, z / largest
         length = (x * x + y * y + z * z).sqrt()
         # those that do not count lie farther off than any that do
-        o = torch.stack([torch.where(seen, t / length, 9.0) for t in (x, y, z)], -1)
-        sets_of = o.view(-1, count, 3), cells.detach().reshape(-1, *cells.shape[-2:]), asks
+        o = columns(*(torch.where(seen, t / length, 9.0) for t in (x, y, z)))
+        sets_of = o.reshape(-1, count, 3), cells.detach().reshape(-1, *cells.shape[-2:]), asks
         found = _by_tree(*sets_of, gate) if o.device.type == "cpu" else _by_all_pairs(*sets_of)
         number, chord = (part.view(shape) for part in found)
     within = asks & (chord <= _chord(gate))
@@ -223,7 +224,7 @@ def _by_tree(o: Tensor, c: Tensor, asks: Tensor, gate: Tensor) -> tuple[Tensor, 
     chord = torch.full(c.shape[:-1], math.inf, dtype=torch.float64)
     reach = float(_chord(gate).max()) * (1 + 1e-6)
     for k, mask in enumerate(asks.view(chord.shape)):
-        tree = cKDTree(o[k].numpy(), balanced_tree=False, compact_nodes=False)  # quick to build: it serves once
+        tree = cKDTree(o[k].numpy(), leafsize=32, balanced_tree=False, compact_nodes=False)  # quick to build, for one use
         far, nearest = tree.query(c[k][mask].numpy(), distance_upper_bound=reach)
         chord[k, mask] = torch.from_numpy(far)
         number[k, mask] = torch.from_numpy(nearest)
