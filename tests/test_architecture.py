@@ -18,7 +18,7 @@ ROOMS = {"sensing", "stereo", "memory", "deciding", "studies"}
 
 # From the ground up. A module imports from its own floor (never in a circle) or from those below it.
 FLOORS = (
-    ("setting", "files", "imported", "finite"),
+    ("setting", "files", "imported", "compiling", "finite"),
     ("gaussian",),
     (
         "camera",
@@ -68,6 +68,7 @@ FLOORS = (
         "fields",
         "geometric",
         "marks",
+        "pinhole",
         "triangulation",
         "association",
         "classes",
@@ -85,6 +86,7 @@ FLOORS = (
         "infomax",
         "strategies",
         "reward",
+        "worth",
         "eligibility",
         "metrics",
         "calibration",

@@ -44,6 +44,7 @@ FRONT_DOOR = [
     "belief",
     "cartesian_belief",
     "choose",
+    "compiled",
     "cortical",
     "cyclopean",
     "decide",

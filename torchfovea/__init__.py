@@ -16,7 +16,7 @@ from torchfovea.memory.moving import Motion, motion, move, resample
 from torchfovea.memory.sphere import DirectionMixture, direction_mixture, log_density, sample
 from torchfovea.memory.store import load_memory, save_memory
 from torchfovea.memory.update import remember
-from torchfovea.perception import Eligibility, Observer, decide, new_memory, perceive
+from torchfovea.perception import Eligibility, Observer, compiled, decide, new_memory, perceive
 from torchfovea.sensing.camera import Fisheye, Pinhole
 from torchfovea.sensing.correspondence import Budget, Correspondences
 from torchfovea.sensing.features import place_features, wrap_around
@@ -57,6 +57,7 @@ __all__ = [
     "belief",
     "cartesian_belief",
     "choose",
+    "compiled",
     "cortical",
     "cyclopean",
     "decide",

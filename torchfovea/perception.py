@@ -4,44 +4,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import InitVar, dataclass, field
+from dataclasses import InitVar, dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from torchfovea.compiling import check_mode, compiling
 from torchfovea.deciding.acquisition import Generators, choose
 from torchfovea.deciding.eligibility import Eligibility
-from torchfovea.deciding.reward import (
-    RewardBelief,
-    inverse_range_from_range,
-    of_class,
-    range_from_inverse_range,
-    range_reward,
-    user_reward,
-)
+from torchfovea.deciding.reward import RewardBelief
 from torchfovea.deciding.strategies import Strategy, View, evaluate, upper_confidence_bound
+from torchfovea.deciding.worth import appraise, worth_of_cells
 from torchfovea.gaussian import Gaussian, columns
-from torchfovea.memory.classes import Classes, class_moments, new_classes
-from torchfovea.memory.egosphere import (
-    Fusion,
-    Memory,
-    Prior,
-    belief,
-    cartesian_from_patches,
-    check_chart,
-    empty_memory,
-    inverse_range_belief,
-    reducible,
-    trust,
-)
+from torchfovea.memory.classes import Classes, new_classes
+from torchfovea.memory.egosphere import Fusion, Memory, Prior, check_chart, empty_memory
 from torchfovea.memory.encoders import encoder_covariance
 from torchfovea.memory.update import Common, remember
 from torchfovea.memory.voting import against, within_sight
 from torchfovea.sensing.camera import Camera, Pinhole
 from torchfovea.sensing.correspondence import Budget, Correspondences
-from torchfovea.sensing.head import Eyes, Gaze, Head, Kinematics, can_fixate, cyclopean, fixate
+from torchfovea.sensing.head import Eyes, Gaze, Head, Kinematics, cyclopean, fixate
 from torchfovea.sensing.kinship import kinship
 from torchfovea.sensing.layout import LogPolar, Retina
 from torchfovea.sensing.triangulation import observe
@@ -50,7 +34,18 @@ from torchfovea.setting import require
 
 SAME_GAZE_DEG = 2.0  # looks nearer to each other than about this see the same pixels of the same surfaces
 
-__all__ = ["Eligibility", "Observer", "Step", "check_owner", "decide", "gaze_at", "new_memory", "perceive", "reward_of"]
+__all__ = [
+    "Eligibility",
+    "Observer",
+    "Step",
+    "check_owner",
+    "compiled",
+    "decide",
+    "gaze_at",
+    "new_memory",
+    "perceive",
+    "reward_of",
+]
 
 
 @dataclass(frozen=True)
@@ -71,6 +66,7 @@ class Observer:
         eligibility: which cells may be fixated.
         classes: what classes of things there are, and which one is sought: a cell's reward is then that of its surface
             times its share of the class. None: whatever is near is good.
+        compile: whether what is hot runs as compiled kernels, see `compiled`: off, auto or on.
 
     How it chooses among them is no part of it: `decide` and `torchfovea.search.search` take a `strategy`.
     """
@@ -86,6 +82,7 @@ class Observer:
     reward: str | Callable[[Tensor], Tensor] = "inverse_range"
     eligibility: Eligibility = field(default_factory=Eligibility)
     classes: Classes | None = None
+    compile: str = "off"
     acquisition: InitVar[None] = None  # where strategies once were
 
     def __post_init__(self, acquisition: None) -> None:
@@ -93,6 +90,7 @@ class Observer:
         given = getattr(acquisition, "__name__", type(acquisition).__name__)
         require(acquisition is None, "Observer(acquisition)", given, "decide(..., strategy=) or search(..., strategy=)")
         require(isinstance(self.head, Head | Kinematics), "head", self.head, "a Head, or Kinematics")
+        check_mode(self.compile)
         known = self.reward in ("inverse_range", "range") or callable(self.reward)
         require(known, "reward", self.reward, "inverse_range, range or a function of points (..., 3)")
         near = self.classes is None or self.reward == "inverse_range"
@@ -120,6 +118,22 @@ class Step(NamedTuple):
     cell: Tensor
     gaze: Gaze
     state: Any = None
+
+
+def compiled(observer: Observer, mode: str = "auto") -> Observer:
+    """The same observer, whose `perceive` and `decide` run as compiled kernels, with equal results to rounding.
+
+    Compiling takes a minute or so the first time, seconds in a new process, and nothing once it is done; see
+    `torchfovea.compiling`.
+
+    Args:
+        observer: any; what its settings leave uncompiled runs as written.
+        mode: `auto`, which falls back with one line where nothing can be compiled; `on`, which raises; or `off`.
+
+    Raises:
+        SettingError: for another mode.
+    """
+    return replace(observer, compile=mode)
 
 
 def new_memory(observer: Observer, cells: Tensor) -> Memory:
@@ -166,9 +180,9 @@ def perceive(
     """
     check_owner(observer, memory)
     support = observer.retina.width_px(matches.left_px) / 2 if matches.support_px is None else matches.support_px
-    observed = observe(
-        matches, eyes, observer.camera, support, observer.points, observer.fusion.chart, observer.rotated
-    )
+    seen = matches, eyes, observer.camera, support, observer.points, observer.fusion.chart, observer.rotated
+    with compiling(observer.compile):
+        observed = observe(*seen)
     sigma = math.radians(observer.head.encoder_deg)
     if common is None and sigma > 0:
         common = partial(encoder_covariance, eyes=eyes, sigma_rad=(sigma,) * 3, chart=observer.fusion.chart)
@@ -178,77 +192,21 @@ def perceive(
         # what looks at one place from one gaze share is all that its fields share
         same = torch.exp(-(((axis - memory.axis).norm(dim=-1, keepdim=True) / math.radians(SAME_GAZE_DEG)).square()))
         kin = kin._replace(lasting=kin.lasting + (kin.shared - kin.lasting).clamp(min=0) * same)
-    after = remember(memory, observed, observer.fusion, common, kin, matches.classes)
+    with compiling(observer.compile):
+        after = remember(memory, observed, observer.fusion, common, kin, matches.classes)
     if observer.fusion.votes:
         missed = within_sight(memory, after.looks == memory.looks, eyes, observer.camera, observer.retina)
         after = after._replace(votes=against(after.votes, missed))
     return after._replace(axis=axis)
 
 
-def _rewards(observer: Observer, memory: Memory) -> tuple[Gaussian, RewardBelief, RewardBelief, Tensor]:
-    """Points of the surfaces, their reward, that of an unseen one (a number, or one for each cell), and a variance.
-
-    The variance is what `torchfovea.memory.egosphere.reducible` asks for.
-    """
-    prior, cartesian = memory.prior, memory.chart == "cartesian"
-    if cartesian:
-        points = belief(memory)
-        rho, variance = None, points.cov[..., 5]
-    else:
-        rho, variance = inverse_range_belief(memory)
-        points = cartesian_from_patches(rho, variance, memory)
-    if not isinstance(observer.reward, str):
-        # the prior's range is uncertain along the ray; in x, y, z it is so in every direction
-        sigma = prior.std if cartesian else prior.std / prior.mean**2
-        x, y, z = memory.cells.unbind(-1)
-        zero, one = torch.zeros_like(x), torch.ones_like(x)
-        shape = (one, zero, zero, one, zero, one) if cartesian else (x * x, x * y, x * z, y * y, y * z, z * z)
-        unseen = Gaussian(_unseen_points(memory), columns(*(sigma**2 * part for part in shape)))
-        return points, user_reward(observer.reward, points), user_reward(observer.reward, unseen), variance
-    like = points.mean.dtype
-    if rho is None:
-        reward = range_reward(points)
-        then = RewardBelief(*(torch.tensor(v, dtype=like) for v in (-prior.mean, prior.std)))
-        if observer.reward == "inverse_range":
-            reward, then = inverse_range_from_range(reward), inverse_range_from_range(then)
-    else:
-        reward = RewardBelief(rho, variance.sqrt())
-        then = RewardBelief(*(torch.tensor(v, dtype=like) for v in (prior.mean, prior.std)))
-        if observer.reward == "range":
-            reward, then = range_from_inverse_range(reward), range_from_inverse_range(then)
-    return points, reward, then, variance
-
-
 def reward_of(observer: Observer, memory: Memory) -> tuple[Gaussian, RewardBelief, Tensor]:
-    """Each cell's 3-D belief, its reward (Eq. 36-40), and the standard deviation that is worth exploring (..., Nx).
-
-    A surface is worth its reward as far as it is believed, for the rest what an unseen cell is: mean and standard
-    deviation are averaged with the prior's by `torchfovea.memory.egosphere.trust`, so that no doubtful surface wins a
-    comparison of thousands. Of the prior's standard deviation looks that should have shown something, and did not,
-    leave less and less. Unseen cells that no look has reached share the prior's reward exactly: ties are ties. What no
-    look can change is not worth exploring, see `torchfovea.memory.egosphere.reducible`. Where a class is sought, all is
-    worth that as far as it is of the class.
-    """
-    points, reward, unseen, variance = _rewards(observer, memory)
-    sure, fruitless = trust(memory), memory.votes[..., 1]
-    mean, std = (then.to(reward.mean) for then in unseen)
-    std = std * (1 + fruitless).rsqrt()
-    mean = torch.where(sure > 0, sure * reward.mean + (1 - sure) * mean, mean)
-    whole, open_to_looks = (
-        torch.where(sure > 0, sure * known + (1 - sure) * std, std)
-        for known in (reward.std, reward.std * reducible(memory, variance).sqrt())
-    )
-    if observer.classes is None or memory.classes is None:
-        return points, RewardBelief(mean, whole), open_to_looks
-    share = class_moments(memory.classes, observer.classes.sought)
-    worth = of_class(RewardBelief(mean, whole), *share)
-    return points, worth, of_class(RewardBelief(mean, open_to_looks), *share).std
+    """What an observer's cells are worth to it, see `torchfovea.deciding.worth.worth_of_cells`."""
+    return worth_of_cells(memory, observer.reward, _sought(observer))
 
 
-def _unseen_points(memory: Memory) -> Tensor:
-    """Where each cell's point would be if it had not been seen, (..., Nx, 3) [m]."""
-    prior = memory.prior.mean
-    return memory.cells * (prior if memory.chart == "cartesian" else 1 / prior)
+def _sought(observer: Observer) -> int | None:
+    return None if observer.classes is None else observer.classes.sought
 
 
 def decide(
@@ -273,21 +231,9 @@ def decide(
         SettingError: for a memory of another chart or prior than the observer's.
     """
     check_owner(observer, memory)
-    points, reward, open_to_looks = reward_of(observer, memory)
-    seen = memory.looks > 0
-    # the eyes meet where the surface is, or where an unseen one would be while it is more likely not there
-    doubted = seen & (trust(memory) < 0.5)
-    at, instead = points.mean.unbind(-1), _unseen_points(memory).unbind(-1)
-    target = columns(*(torch.where(doubted, there, here) for there, here in zip(instead, at, strict=True)))
-    (x, y, z), limits = at, observer.eligibility
-    surely = z - limits.ground_sigmas * points.cov[..., 5].sqrt()
-    ground = seen & (surely + observer.head.ego_height_m < limits.ground_z_m)
-    far_enough = (x * x).addcmul_(y, y).addcmul_(z, z) > limits.nearest_m**2
-    eligible = can_fixate(observer.head, target) & far_enough & ~ground
-    floor = torch.full_like(reward.mean, -torch.inf)
-    incumbent = torch.where(eligible & seen, reward.mean, floor).amax(-1)
-    incumbent = torch.where(torch.isfinite(incumbent), incumbent, torch.where(eligible, reward.mean, floor).amax(-1))
-    incumbent = torch.where(torch.isfinite(incumbent), incumbent, torch.zeros_like(incumbent))
+    with compiling(observer.compile):
+        appraised = appraise(memory, observer.reward, _sought(observer), observer.head, observer.eligibility)
+    points, reward, open_to_looks, target, eligible, incumbent = appraised
     zero = torch.zeros_like(incumbent)
     view = View(
         reward.mean,

@@ -186,8 +186,10 @@ def empty_memory(cells: Tensor, prior: Prior, chart: str = "inverse_range") -> M
     require(unit, "cells", "directions", "finite unit vectors")
     zero = torch.zeros_like(cells[..., 0])
     found = build_index(cells), neighbour_spacing_rad(cells)
-    known = prior_information(cells, prior, chart)
-    return Memory(cells, *known, zero, columns(zero, zero), columns(zero, zero), *found, prior, chart)
+    first, bearing = prior_information(cells, prior, chart)
+    # copies: kernels are compiled anew for what is a view of other tensors, as these are, but not after the first look
+    known = Information(*(part.clone() for part in first)), bearing
+    return Memory(cells, *known, zero, columns(zero, zero).clone(), columns(zero, zero), *found, prior, chart)
 
 
 def check_chart(memory: Memory, chart: str, whose: str) -> None:

@@ -224,7 +224,8 @@ def _by_tree(o: Tensor, c: Tensor, asks: Tensor, gate: Tensor) -> tuple[Tensor, 
     chord = torch.full(c.shape[:-1], math.inf, dtype=torch.float64)
     reach = float(_chord(gate).max()) * (1 + 1e-6)
     for k, mask in enumerate(asks.view(chord.shape)):
-        tree = cKDTree(o[k].numpy(), leafsize=32, balanced_tree=False, compact_nodes=False)  # quick to build, for one use
+        # quick to build: it serves once
+        tree = cKDTree(o[k].numpy(), leafsize=32, balanced_tree=False, compact_nodes=False)
         far, nearest = tree.query(c[k][mask].numpy(), distance_upper_bound=reach)
         chord[k, mask] = torch.from_numpy(far)
         number[k, mask] = torch.from_numpy(nearest)

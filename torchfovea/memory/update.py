@@ -13,6 +13,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from torchfovea.compiling import kernel
 from torchfovea.gaussian import Gaussian, Information, columns
 from torchfovea.memory.association import Pairs, associate, gather_columns
 from torchfovea.memory.classes import join_evidence
@@ -88,7 +89,9 @@ def remember(
         memory = memory._replace(classes=join_evidence(memory.classes, evidence, pairs))
     if memory.chart == "cartesian":
         return _remember_points(memory, observed, pairs, fusion, common)
-    return _remember_patches(memory, observed, pairs, fusion, common, kin)
+    # where the eye looked last is not asked: what comes with the first look would have to be compiled anew
+    after = _remember_patches(memory._replace(axis=None), observed, pairs, fusion, common, kin)
+    return after._replace(axis=memory.axis)
 
 
 def _like(cells: Tensor, observed: Observations) -> Observations:
@@ -113,6 +116,7 @@ def _remember_points(
     return fuse(memory._replace(votes=columns(yes + (pooled.hits > 0), no)), pooled)
 
 
+@kernel
 def _remember_patches(
     memory: Memory,
     observed: Observations,

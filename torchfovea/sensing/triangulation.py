@@ -9,19 +9,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchfovea.compiling import is_compiling
 from torchfovea.gaussian import columns, definiteness
 from torchfovea.sensing.camera import Camera, Pinhole
 from torchfovea.sensing.chart import Components, bilinear_moments, in_tangent_frame
 from torchfovea.sensing.correspondence import Correspondences
 from torchfovea.sensing.head import Eyes, rig_frame
 from torchfovea.sensing.head import to_ego as turn
-from torchfovea.sensing.unscented import (
-    SigmaPoints,
-    eye_root,
-    moments,
-    root_rows,
-    sigma_components,
-)
+from torchfovea.sensing.pinhole import pinhole_observations, weights_of
+from torchfovea.sensing.unscented import SigmaPoints, eye_root, moments, root_rows, sigma_components
 from torchfovea.setting import require
 
 __all__ = ["Observations", "observe", "triangulate", "triangulate_rectified"]
@@ -188,17 +184,21 @@ def observe(
     frame, origin, baseline = rig_frame(eyes)
     cameras = camera if isinstance(camera, tuple) else (camera, camera)
     rig = _Rig(frame, origin, baseline, frame.mT @ eyes.R_left, frame.mT @ eyes.R_right, *cameras)
+    form = None
     transform = partial(_transform, rig=rig, points=points, chart=chart, rotated=rotated)
     if chart == "inverse_range" and isinstance(cameras[0], Pinhole) and isinstance(cameras[1], Pinhole):
-        transform = partial(_transform_form, form=_form(rig, cameras[0], cameras[1]), points=points, rotated=rotated)
-    size = count
+        form = _form(rig, cameras[0], cameras[1])
+        transform = partial(_transform_form, form=form, points=points, rotated=rotated)
     learning = torch.is_grad_enabled() and any(t.requires_grad for t in (*matches[:4], *eyes))
     if learning:
         matches = _safe(matches, cameras, transform)
-    if matches.valid.device.type == "cpu" and not learning:
-        size = -(-count // max(1, round(matches.valid.numel() / (BLOCK * torch.get_num_threads()))))
+    blocks = max(1, round(matches.valid.numel() / (BLOCK * torch.get_num_threads())))
+    size = count if learning or matches.valid.device.type != "cpu" else -(-count // blocks)
     parts = []
-    for start in range(0, max(count, 1), max(size, 1)):
+    if form is not None and is_compiling() and not learning:
+        arguments = (*matches[:2], (matches[2], matches[3]), matches.valid, form, weights_of(points), rotated)
+        parts = [pinhole_observations(*arguments)]
+    for start in () if parts else range(0, max(count, 1), max(size, 1)):
         axes = zip(matches[:5], (-2, -2, -1, -1, -1), strict=True)
         part = Correspondences(*(t.narrow(axis, start, min(size, count - start)) for t, axis in axes))
         parts.append(_settled(part, *transform(part)))

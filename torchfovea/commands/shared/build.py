@@ -100,6 +100,7 @@ def build_observer(cfg: DictConfig) -> Observer:
         prior=construct(Prior, cfg.prior, "prior"),
         reward=build_reward(cfg),
         eligibility=construct(Eligibility, cfg.eligibility, "eligibility"),
+        compile=str(OmegaConf.select(cfg, "compile", default="off")),
         classes=build_classes(cfg),
     )
 

@@ -1,0 +1,118 @@
+"""Hot functions as one kernel each, by `torch.compile`; as they are written they remain the definition.
+
+A kernel is compiled the first time that it runs where compiling is on, for half a minute or so. Its machine code is
+kept on disk, under a key that PyTorch makes of all that it depends on, so that another process starts within seconds.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import wraps
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+import torch
+
+from torchfovea.setting import SettingError, require
+
+__all__ = ["MODES", "check_mode", "compiling", "is_compiling", "kernel"]
+
+MODES = ("off", "auto", "on")
+
+_BACKEND = "inductor"
+_MODE: ContextVar[str] = ContextVar("compile", default="off")
+
+_Given = ParamSpec("_Given")
+_Made = TypeVar("_Made")
+
+
+def check_mode(mode: object) -> None:
+    """Raise SettingError unless a mode is one of `MODES`."""
+    require(mode in MODES, "compile", mode, "one of " + ", ".join(MODES))
+
+
+@contextmanager
+def compiling(mode: str) -> Iterator[None]:
+    """Within it, kernels run compiled.
+
+    Args:
+        mode: `off`: not at all; `auto`: as written where they cannot be compiled, with one line of warning; `on`: there
+            is no such excuse.
+
+    Raises:
+        SettingError: for another mode; with `on`, from a kernel that cannot be compiled.
+    """
+    check_mode(mode)
+    token = _MODE.set(mode)
+    try:
+        yield
+    finally:
+        _MODE.reset(token)
+
+
+def is_compiling() -> bool:
+    """Whether kernels run compiled here."""
+    return _MODE.get() != "off"
+
+
+def kernel(function: Callable[_Given, _Made]) -> Callable[_Given, _Made]:
+    """A pure function of (nested tuples of) tensors and settings that can run compiled, see `compiling`.
+
+    Where a gradient is wanted it runs as written.
+    """
+    compiled: dict[Any, Callable[_Given, _Made] | None] = {}
+
+    @wraps(function)
+    def run(*args: _Given.args, **kwargs: _Given.kwargs) -> _Made:
+        if _MODE.get() == "off" or (torch.is_grad_enabled() and _wants_gradient((args, tuple(kwargs.values())))):
+            return function(*args, **kwargs)
+        first = _BACKEND not in compiled
+        if first:
+            os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(_cache()))
+            compiled[_BACKEND] = torch.compile(function, fullgraph=True, dynamic=True, backend=_BACKEND)
+        fast = compiled[_BACKEND]
+        if fast is None:
+            return function(*args, **kwargs)
+        try:
+            # settings are constants of a kernel, sizes are not
+            with torch.no_grad(), _quiet(first), torch._dynamo.config.patch(specialize_float=True):
+                return fast(*args, **kwargs)
+        except Exception as cause:  # of the compiler, or of the caller: then the function itself raises it, too
+            result = function(*args, **kwargs)
+            why = " ".join(str(cause).split("\n\n")[0].split()) or type(cause).__name__
+            if _MODE.get() == "on":
+                raise SettingError(
+                    f"compile = on: expected that {function.__name__} can be compiled here, or auto ({why})"
+                ) from cause
+            compiled[_BACKEND] = None
+            warnings.warn(f"{function.__name__} runs as written, not compiled: {why}", RuntimeWarning, stacklevel=2)
+            return result
+
+    return run
+
+
+@contextmanager
+def _quiet(wanted: bool) -> Iterator[None]:
+    """What PyTorch says to itself while it compiles is nothing to warn a user of."""
+    if not wanted:
+        yield
+        return
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def _wants_gradient(value: Any) -> bool:
+    if isinstance(value, tuple | list):
+        return any(map(_wants_gradient, value))
+    return isinstance(value, torch.Tensor) and value.requires_grad
+
+
+def _cache() -> Path:
+    """Where machine code is kept, unless PyTorch has been told another place."""
+    home = os.environ.get("XDG_CACHE_HOME")
+    return (Path(home) if home else Path.home() / ".cache") / "torchfovea" / "kernels"
