@@ -223,7 +223,7 @@ def test_invalid_is_finite_and_float32_is_float64():
     observed = observe(broken, pose, CAMERA, HALF)
     assert observed.valid.sum() == 19 and all(bool(torch.isfinite(x).all()) for x in observed[:6])
     single = observe(
-        Correspondences(*(x.float() if x.is_floating_point() else x for x in matches)),
+        Correspondences(*(x.float() if x is not None and x.is_floating_point() else x for x in matches)),
         Eyes(*(x.float() for x in pose)),
         CAMERA,
         HALF,
@@ -275,7 +275,7 @@ def test_the_bilinear_form_is_the_transform_point_by_point(points, rotated, monk
 
 def test_float32_is_as_good_by_the_bilinear_form(monkeypatch):
     matches, pose = stereo(cloud(2000, 4), 0.1)
-    single = Correspondences(*(x.float() if x.is_floating_point() else x for x in matches))
+    single = Correspondences(*(x.float() if x is not None and x.is_floating_point() else x for x in matches))
     rough = Eyes(*(x.float() for x in pose))
     truth, quick = observe(matches, pose, CAMERA, HALF), observe(single, rough, CAMERA, HALF)
     general(monkeypatch)

@@ -164,6 +164,7 @@ def _tabulate(table: Table, path: Path, timings: list[Timing], over: float | Non
 def _builders(cfg: DictConfig, device: str, wanted: Sequence[str]) -> list[Callable[[], list[Path]]]:
     """What makes the paths, each when its turn comes."""
     full = build_observer(cfg)
+    full, mode = dataclasses.replace(full, compile="off"), full.compile
     require(isinstance(full.retina, LogPolar), "sensor.layout", cfg.sensor.layout, "log_polar, in bench")
     require(cfg.sensor.camera == "pinhole", "sensor.camera", cfg.sensor.camera, "pinhole, in bench")
     require(full.fusion.chart == "inverse_range", "fusion", full.fusion.name, "inverse_range, in bench")
@@ -183,7 +184,7 @@ def _builders(cfg: DictConfig, device: str, wanted: Sequence[str]) -> list[Calla
 
     @cache
     def look() -> Saccade:
-        return saccade(plain, cells_of(cfg), device)
+        return saccade(plain, cells_of(cfg), device)._replace(compile=mode)
 
     builders: list[tuple[tuple[str, ...], Callable[[], list[Path]]]] = [
         (("retina",), lambda: path_of_retina(_log_polar(full), source, batch, device)),

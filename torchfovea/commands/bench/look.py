@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from torchfovea.commands.bench.timing import Peer
 from torchfovea.gaussian import columns
 from torchfovea.memory.egosphere import Memory
-from torchfovea.perception import Observer, new_memory
+from torchfovea.perception import Observer, compiled, new_memory
 from torchfovea.rows import stack
 from torchfovea.sensing.correspondence import Correspondences
 from torchfovea.sensing.fields import for_all
 from torchfovea.sensing.geometric import correspond_points, with_noise
 from torchfovea.sensing.head import Eyes, eyes, fixate, to_ego
 
-__all__ = ["Saccade", "batch_of", "flat_of", "moved_to", "part_of", "saccade", "shares", "support_of"]
+__all__ = ["Saccade", "batch_of", "compiled_peer", "flat_of", "moved_to", "part_of", "saccade", "shares", "support_of"]
 
 
 class Saccade(NamedTuple):
@@ -29,6 +31,7 @@ class Saccade(NamedTuple):
         matches: of a look (N,).
         pose: of the eyes.
         alpha: of the upper confidence bound that decides.
+        compile: how compiled kernels are timed beside what is written, see `torchfovea.compiling`; off: not.
     """
 
     observer: Observer
@@ -36,6 +39,7 @@ class Saccade(NamedTuple):
     matches: Correspondences
     pose: Eyes
     alpha: float = 1.0
+    compile: str = "off"
 
 
 def moved_to(value: Any, device: str) -> Any:
@@ -67,6 +71,20 @@ def part_of(look: Saccade, count: int) -> Saccade:
     kept = look.matches.take(every)
     left_px, right_px = (columns(*part.unbind(-1)) for part in kept[:2])
     return look._replace(matches=for_all(kept._replace(left_px=left_px, right_px=right_px), look.observer.retina))
+
+
+def compiled_peer(look: Saccade, run: Callable[[Observer], Any]) -> tuple[Peer, ...]:
+    """The same work by compiled kernels, where they are to be timed too.
+
+    Args:
+        look: says whether, and by which observer.
+        run: does the work with an observer.
+    """
+    if look.compile == "off":
+        return ()
+    quick = partial(run, compiled(look.observer, look.compile))
+    quick()  # compiles
+    return (Peer("ours, compiled", quick),)
 
 
 def support_of(look: Saccade) -> Tensor:

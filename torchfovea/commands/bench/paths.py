@@ -11,15 +11,16 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchfovea.commands.bench import peers
-from torchfovea.commands.bench.look import Saccade, flat_of, moved_to, part_of, shares, support_of
+from torchfovea.commands.bench.look import Saccade, compiled_peer, flat_of, moved_to, part_of, shares, support_of
 from torchfovea.commands.bench.timing import Growth, Path, Peer, nbytes, same
+from torchfovea.compiling import compiling
 from torchfovea.gaussian import Gaussian, columns, pack, unpack
 from torchfovea.memory.association import Pairs, associate, gather_columns
 from torchfovea.memory.egosphere import Prior, belief, empty_memory
 from torchfovea.memory.nearest import nearest_cell
 from torchfovea.memory.pooling import pool, pool_patches
 from torchfovea.memory.update import fuse
-from torchfovea.perception import new_memory
+from torchfovea.perception import Observer, new_memory
 from torchfovea.sensing.chart import basis
 from torchfovea.sensing.triangulation import Observations, observe
 from torchfovea.sensing.unscented import SigmaPoints
@@ -31,6 +32,11 @@ _LOOPED, _FORCED = 100, 1000  # receptive fields that the slow peers go through
 
 def _observe(look: Saccade, support: Tensor) -> Observations:
     return observe(look.matches, look.pose, look.observer.camera, support)
+
+
+def _compiled(observer: Observer, look: Saccade, support: Tensor) -> Observations:
+    with compiling(observer.compile):
+        return _observe(look, support)
 
 
 def _triangulate(look: Saccade) -> Path:
@@ -73,6 +79,7 @@ def _triangulate(look: Saccade) -> Path:
                 loop,
                 count / len(some),
             ),
+            *compiled_peer(look, lambda quick: _compiled(quick, look, support)),
         ),
         check,
         nbytes(look.matches, support, _observe(look, support)),

@@ -11,7 +11,17 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchfovea.commands.bench import peers
-from torchfovea.commands.bench.look import Saccade, batch_of, flat_of, moved_to, part_of, saccade, shares, support_of
+from torchfovea.commands.bench.look import (
+    Saccade,
+    batch_of,
+    compiled_peer,
+    flat_of,
+    moved_to,
+    part_of,
+    saccade,
+    shares,
+    support_of,
+)
 from torchfovea.commands.bench.timing import Growth, Path, Peer, nbytes, same
 from torchfovea.deciding.strategies import Strategy, upper_confidence_bound
 from torchfovea.gaussian import columns, unpack
@@ -76,12 +86,13 @@ def _decide(look: Saccade) -> Path:
         return partial(choose, less)
 
     done = ours()
+    fast = compiled_peer(look, lambda quick: decide(quick, memory, strategy=_strategy(look)))
     return Path(
         "decide",
         f"{len(memory.cells)} cells",
         str(memory.cells.device),
         ours,
-        (Peer("NumPy, linalg.inv", theirs),),
+        (Peer("NumPy, linalg.inv", theirs), *fast),
         check,
         nbytes(memory, done.points, done.reward, done.eligible),
         (Growth("cells", sizes, tuple(map(part, sizes))),),
@@ -91,6 +102,10 @@ def _decide(look: Saccade) -> Path:
 def _one_step(look: Saccade) -> Any:
     memory = perceive(look.observer, look.memory, look.matches, look.pose)
     return decide(look.observer, memory, strategy=_strategy(look))
+
+
+def _step_by(look: Saccade, observer: Observer) -> Any:
+    return _one_step(look._replace(observer=observer))
 
 
 def _step(look: Saccade, full: Observer) -> list[Path]:
@@ -112,7 +127,7 @@ def _step(look: Saccade, full: Observer) -> list[Path]:
         _same_choice("step", ours(), theirs(), 0.99)
 
     def check_full() -> None:
-        if int(_one_step(look._replace(observer=full)).cell) < 0:
+        if int(_one_step(whole).cell) < 0:
             raise RuntimeError("step: nothing to fixate")
 
     done, device = ours(), str(memory.cells.device)
@@ -126,11 +141,13 @@ def _step(look: Saccade, full: Observer) -> list[Path]:
         Growth("RFs", sizes, tuple(partial(_one_step, part_of(look, n)) for n in sizes)),
         Growth("cells", cell_sizes, by_cells),
     )
+    whole = look._replace(observer=full)
+    fast, fast_whole = (compiled_peer(one, partial(_step_by, one)) for one in (look, whole))
     moved = nbytes(look.matches, memory, done.memory, done.points, done.reward, done.eligible)
     return [
-        Path("step", work, device, ours, (Peer("NumPy and SciPy, vectorized", theirs),), check, moved, growths),
+        Path("step", work, device, ours, (Peer("NumPy and SciPy, vectorized", theirs), *fast), check, moved, growths),
         Path(
-            "step", work + ", with fill and conflicts", device, partial(_one_step, look._replace(observer=full)), (),
+            "step", work + ", with fill and conflicts", device, partial(_one_step, whole), fast_whole,
             check_full, moved,
         ),
     ]  # fmt: skip
