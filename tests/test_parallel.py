@@ -1,5 +1,6 @@
 """Work in processes of joblib's: all of it comes back, errors as they are; commands are the same with more of them."""
 
+import importlib.util
 import os
 
 import pytest
@@ -32,6 +33,19 @@ def test_work_that_is_left_ends():
     next(work)
     work.close()
     assert len(list(spread(square, range(4), 2))) == 4
+
+
+def test_processes_find_what_the_command_finds_there(tmp_path, monkeypatch):
+    """Also where joblib has kept processes of a command from elsewhere."""
+    assert len(list(spread(square, range(4), 2))) == 4
+    (tmp_path / "module_of_the_day.py").write_text("")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert dict(spread(_place, range(2), 2)) == {0: (str(tmp_path), True), 1: (str(tmp_path), True)}
+
+
+def _place(k: int) -> tuple[str, bool]:
+    return os.getcwd(), importlib.util.find_spec("module_of_the_day") is not None
 
 
 def test_a_backend_that_is_not_there():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import threading
 import time
 import warnings
@@ -54,7 +55,9 @@ def spread(
         return
     settings: dict[str, Any] = {}
     if backend == "loky":
-        settings = {"inner_max_num_threads": 1, "initializer": _begin, "initargs": (os.getpid(),)}
+        # joblib keeps its processes for the next call: not for one from elsewhere, which finds other modules
+        origin = os.getpid(), os.getcwd(), tuple(sys.path)
+        settings = {"inner_max_num_threads": 1, "initializer": _begin, "initargs": origin}
     try:
         chosen = parallel_config(backend, n_jobs=min(workers, len(numbered)), **settings)
     except (ValueError, ImportError) as error:
@@ -80,7 +83,9 @@ def _attempt(function: Callable[[Item], Result], number: int, item: Item) -> tup
         return number, error
 
 
-def _begin(command: int) -> None:
+def _begin(command: int, folder: str, path: tuple[str, ...]) -> None:
+    os.chdir(folder)
+    sys.path[:] = path
     torch.set_num_threads(1)
     threading.Thread(target=_end_with, args=(command,), daemon=True).start()
 
