@@ -29,7 +29,7 @@ def job(tmp_path, monkeypatch):
         (tmp_path / "job_under_test.py").write_text(code)
         monkeypatch.syspath_prepend(str(tmp_path))
         monkeypatch.delitem(sys.modules, "job_under_test", raising=False)
-        monkeypatch.setitem(COMMANDS, "doctor", Command("job_under_test:run", "", ""))
+        monkeypatch.setitem(COMMANDS, "doctor", Command("job_under_test:run", "", ()))
 
     return put
 
@@ -49,7 +49,7 @@ def test_help_lists_the_commands(capsys):
         for name, command in COMMANDS.items():
             assert name in printed
             assert command.summary in printed
-            assert command.example in printed
+            assert command.examples[0] in printed
 
 
 def test_version(capsys):
@@ -70,7 +70,9 @@ def test_every_command_has_its_function_and_its_configuration(name):
 def test_every_command_shows_its_settings(name, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main([name, "--help"]) == 0
-    assert "seed: 0" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "seed: 0" in said
+    assert [line.strip() for line in said.splitlines()[2:5]] == list(COMMANDS[name].examples)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -147,6 +149,20 @@ def test_a_run_prints_its_folder_last_and_keeps_its_settings(job, capsys, tmp_pa
     assert Path(last).parent == tmp_path / "outputs" / "doctor"
     assert {entry.name for entry in Path(last).iterdir()} == {".hydra", "doctor.log", "x"}
     assert "seed: 7" in (Path(last) / ".hydra" / "config.yaml").read_text()
+
+
+def test_a_run_says_what_to_open(job, capsys):
+    names = ["points.ply", "report.html", "a.png", "b.png", "c.png", "d.png", "e.png", "x.csv", "settings.yaml"]
+    job(f"from torchfovea.commands.shared.config import run_folder\n[(run_folder() / n).touch() for n in {names}]")
+    assert main(["doctor"]) == 0
+    *opened, folder = capsys.readouterr().out.splitlines()
+    assert opened == [
+        "open report.html: in a browser",
+        "open a.png, b.png, c.png, d.png and 1 more: the pictures",
+        "open points.ply: points, in MeshLab, CloudCompare or Open3D",
+        "open x.csv: the figures, as a table",
+    ]
+    assert Path(folder).is_dir()
 
 
 def test_a_setting_can_be_wrong(job, capsys, tmp_path):
@@ -245,7 +261,7 @@ def test_one_failing_job_does_not_stop_the_others(launcher, job, capfd, tmp_path
     )
     if launcher == "joblib":
         # Workers look the command up for themselves: give them the real one, whose checks fail for one job.
-        COMMANDS["doctor"] = Command("torchfovea.commands.doctor:run", "", "")
+        COMMANDS["doctor"] = Command("torchfovea.commands.doctor:run", "", ())
         # Those of an earlier sweep would keep its working folder and write to where its output went.
         get_reusable_executor().shutdown()
         sweep = [
@@ -295,7 +311,7 @@ def test_doctor(tmp_path):
     assert result["sgbm"] is True
     table = (folder / "doctor.csv").read_text().splitlines()
     assert table[0] == "item,found,note"
-    assert {"torch", "kornia", "mujoco", "renderer=gl", "C++ compiler"} <= {line.split(",")[0] for line in table}
+    assert {"torch", "kornia", "[sim]", "renderer=gl", "C++ compiler"} <= {line.split(",")[0] for line in table}
 
 
 def test_doctor_names_a_probe_that_does_not_answer(tmp_path, monkeypatch, capsys):
@@ -322,7 +338,7 @@ def test_ctrl_c(tmp_path):
         # as a terminal leaves it: a job in the background inherits it ignored
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "def run(cfg):\n    print('started', flush=True)\n    time.sleep(60)\n"
-        "COMMANDS['doctor'] = Command('waiting:run', '', '')\n"
+        "COMMANDS['doctor'] = Command('waiting:run', '', ())\n"
         "if __name__ == '__main__':\n    sys.exit(main(['doctor']))\n"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(tmp_path)])}

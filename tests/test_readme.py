@@ -126,6 +126,16 @@ def test_every_command_is_named():
         assert set(re.findall(r"^\| `(\w+)` \|", PAGES[page], re.MULTILINE)) == set(COMMANDS), page
 
 
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_examples_of_the_help_compose(name):
+    examples = COMMANDS[name].examples
+    assert len(examples) == 3
+    with initialize_config_dir(conf_dir(), version_base="1.3"):
+        for line in examples:
+            assert line.startswith(f"torchfovea {name}")
+            check(line)
+
+
 @pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md"])  # those of the site are the next test's
 def test_links_lead_somewhere(page):
     folder = (ROOT / page).parent

@@ -13,95 +13,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torchfovea
+from torchfovea.commands.table import COMMANDS, Command
 
 __all__ = ["COMMANDS", "Command", "main"]
-
-
-class Command(NamedTuple):
-    """A command: where its function lies (imported only when chosen), and its lines in the help."""
-
-    target: str
-    summary: str
-    example: str
-    resumes: bool = False
-    draws: bool = False
-
-
-# A command NAME is a function of its composed configuration conf/NAME.yaml; what it returns is the score that
-# Hydra's sweepers see.
-COMMANDS: dict[str, Command] = {
-    "search": Command(
-        "torchfovea.commands.search.command:run",
-        "find the nearest object by saccades, and map the scene: the main job",
-        "torchfovea search scene=cans sensor=uniform acquisition.alpha=2",
-        resumes=True,
-        draws=True,
-    ),
-    "sense": Command(
-        "torchfovea.commands.sense.command:run",
-        "a stereo pair in, 3-D points with covariances out",
-        "torchfovea sense pair=motorcycle",
-        draws=True,
-    ),
-    "replay": Command(
-        "torchfovea.commands.replay.command:run",
-        "a recording into the memory, the next fixation proposed at each frame",
-        "torchfovea replay recording=outputs/search/NAME/recording",
-        draws=True,
-    ),
-    "characterize": Command(
-        "torchfovea.commands.characterize.command:run",
-        "what two eyes know of planes, foveal and uniform (Fig. 5), and how far to believe it",
-        "torchfovea characterize profile=quick",
-        resumes=True,
-        draws=True,
-    ),
-    "tune": Command(
-        "torchfovea.commands.tune.command:run",
-        "learn the memory's bias and alpha by gradient on simulated episodes",
-        "torchfovea tune profile=quick distribution=left_below",
-        resumes=True,
-        draws=True,
-    ),
-    "reproduce": Command(
-        "torchfovea.commands.reproduce.command:run",
-        "the paper's figures and claims, measured again, with intervals and verdicts",
-        "torchfovea reproduce profile=quick",
-        resumes=True,
-        draws=True,
-    ),
-    "collect": Command(
-        "torchfovea.commands.collect:run",
-        "a sweep's results in one table",
-        "torchfovea collect dir=multirun/search/study",
-    ),
-    "calibrate": Command(
-        "torchfovea.commands.calibrate.command:run",
-        "is the claimed uncertainty true? fit the error budget and judge it",
-        "torchfovea calibrate real=true",
-        draws=True,
-    ),
-    "memory": Command(
-        "torchfovea.commands.memory.command:run",
-        "draw and describe a memory's bias, or study how the memory fuses, moves and is drawn anew",
-        "torchfovea memory memory=target",
-    ),
-    "bench": Command(
-        "torchfovea.commands.bench.command:run",
-        "how long the hot paths take, beside the peers that one would pick",
-        "torchfovea bench profile=quick",
-    ),
-    "benchmark": Command(
-        "torchfovea.commands.benchmark.command:run",
-        "policies, matchers, memories and whole systems on the same scenes, and a leaderboard",
-        "torchfovea benchmark profile=quick",
-        resumes=True,
-    ),
-    "doctor": Command("torchfovea.commands.doctor:run", "what this machine can render and has", "torchfovea doctor"),
-}
 
 
 class JobFailed(Exception):
@@ -151,8 +68,11 @@ def _help() -> str:
     lines = ["torchfovea COMMAND [setting=value ...]", "", "commands:"]
     lines += [f"  {name:<{width}}  {command.summary}" for name, command in COMMANDS.items()]
     lines += ["", "examples:"]
-    lines += [f"  {command.example}" for command in COMMANDS.values()]
-    lines += ["", "torchfovea COMMAND --help lists a command's settings; HYDRA_FULL_ERROR=1 shows whole tracebacks."]
+    lines += [f"  {command.examples[0]}" for command in COMMANDS.values()]
+    lines += [
+        "",
+        "torchfovea COMMAND --help has more examples and all settings; HYDRA_FULL_ERROR=1 shows whole tracebacks.",
+    ]
     return "\n".join(lines)
 
 
@@ -200,7 +120,8 @@ def _run(command: str, overrides: list[str]) -> int:
         _complain(f"torchfovea {command}", str(error))
         return 2
     if set(overrides) & {"-h", "--help"} and not any(o.startswith(("--config", "-c")) for o in overrides):
-        print(f"torchfovea {command} [setting=value ...]: {COMMANDS[command].summary}")
+        print(f"torchfovea {command} [setting=value ...]: {COMMANDS[command].summary}", "", sep="\n")
+        print(*(f"  {example}" for example in COMMANDS[command].examples), "", sep="\n")
         print(help_text(command))
         return 0
     full_error = os.environ.get("HYDRA_FULL_ERROR") == "1"
@@ -248,6 +169,7 @@ def _job(command: str, overrides: list[str], full_error: bool) -> Callable[[Any]
         from torchfovea.commands.shared.config import run_folder
         from torchfovea.commands.shared.manifest import MANIFEST, record, unclaimed, withdraw
         from torchfovea.commands.shared.mistakes import describe, need
+        from torchfovea.commands.shared.opening import to_open
         from torchfovea.commands.shared.trust import check_said
 
         folder = run_folder()
@@ -289,8 +211,10 @@ def _job(command: str, overrides: list[str], full_error: bool) -> Callable[[Any]
             _remove_bare(folder, settings.name)
             # Not an Exception, so that Hydra adds no line of its own.
             raise SystemExit(1) from None
-        if sweeping or not _remove_bare(folder, settings.name):
+        if sweeping:
             print(folder, flush=True)
+        elif not _remove_bare(folder, settings.name):
+            print(*to_open(folder), folder, sep="\n", flush=True)
         return score
 
     return job

@@ -1,8 +1,7 @@
-"""``torchfovea doctor``: what this machine can render and has."""
+"""``torchfovea doctor``: what this machine has and can render, and what to install for what it lacks."""
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import os
 import platform
@@ -16,26 +15,14 @@ import torch
 from omegaconf import DictConfig
 
 from torchfovea.commands.shared.config import conf_dir, run_folder
+from torchfovea.commands.shared.extras import DEFAULTS, EXTRAS, install, is_there, version
 from torchfovea.files import write_csv, write_result
 from torchfovea.setting import require
 
 __all__ = ["Finding", "run"]
 
-# What the defaults need, and what each of the others is for.
+# What `import torchfovea` and its command line need.
 REQUIRED = ("torch", "kornia", "numpy", "scipy", "filterpy", "hydra-core", "joblib", "rich")
-DEFAULTS = ("mujoco", "matplotlib")
-OPTIONAL = {
-    "mujoco": "simulated worlds: pip install 'torchfovea[sim]'",
-    "opencv-python-headless": "the default matcher: pip install 'torchfovea[stereo]'",
-    "matplotlib": "pictures: pip install 'torchfovea[viz]'",
-    "scikit-image": "sense pair=motorcycle: pip install 'torchfovea[samples]'",
-    "hydra-joblib-launcher": "sweeps on all cores: pip install 'torchfovea[sweep]'",
-    "hydra-submitit-launcher": "sweeps on a cluster: pip install 'torchfovea[sweep]'",
-    "hydra-ray-launcher": "sweeps with Ray: pip install 'torchfovea[ray]'",
-    "cma": "tuning without gradients: pip install 'torchfovea[tune]'",
-    "optuna": "tuning without gradients: pip install 'torchfovea[tune]'",
-    "onnxruntime": "matcher=onnx: pip install 'torchfovea[onnx]'",
-}
 
 # Each probe runs in a process of its own: a broken GL set-up can end the process that imports MuJoCo, and MUJOCO_GL is
 # read at that import. It prints one line of JSON last.
@@ -89,23 +76,23 @@ def run(cfg: DictConfig) -> None:
     require(known and timeout_s > 0, "probe_timeout_s", timeout_s, "a positive number")
     require(timeout_s <= 1e6, "probe_timeout_s", timeout_s, "a positive number of seconds, at most 1e6")
     require(isinstance(cfg.save, bool), "save", cfg.save, "true or false")
-    missing = [name for name in REQUIRED if not _version(name)]
+    required = [name for name in REQUIRED if not version(name)]
+    absent = [name for name, extra in EXTRAS.items() if not all(map(is_there, extra.packages))]
     rays, rays_error = _probe(RAYS, timeout_s)
     sgbm, sgbm_error = _probe(SGBM, timeout_s)
     gl, gl_error = _probe(GL, timeout_s)
     # A backend's name, a list of them, or nothing.
     backends = [gl] if isinstance(gl, str) else [str(name) for name in gl or []]
     compiler = _compiler()
-    cuda = torch.cuda.is_available()
-    missing += [name for name in DEFAULTS if not _version(name)]  # OpenCV goes by several names: the probe tells
-    ok = not missing and rays is True and sgbm is True
+    needed = [name for name in DEFAULTS if name in absent]
+    ok = not required and not needed and rays is True and sgbm is True
 
     findings = [
         Finding("python", platform.python_version(), sys.executable),
-        *(Finding(name, _version(name), "" if _version(name) else "needed") for name in REQUIRED),
-        *(Finding(name, _version(name), "" if _version(name) else why) for name, why in OPTIONAL.items()),
+        *(Finding(name, version(name), "" if version(name) else "needed") for name in REQUIRED),
+        *(_extra(name) for name in EXTRAS),
         Finding("threads", str(torch.get_num_threads()), f"{os.cpu_count()} processors; OMP_NUM_THREADS sets them"),
-        Finding("CUDA", torch.cuda.get_device_name() if cuda else "", "" if cuda else "everything runs on the CPU"),
+        *_devices(),
         Finding("C++ compiler", compiler, "" if compiler else "only torch.compile needs one"),
         Finding("renderer=rays", "works" if rays else "", rays_error),
         Finding("renderer=gl", ", ".join(backends), gl_error if not backends else ""),
@@ -114,6 +101,10 @@ def run(cfg: DictConfig) -> None:
     ]
     _show(findings)
     print(f"The defaults (rays, SGBM, pictures) can{'' if ok else 'not'} run{'.' if ok else ': see above.'}")
+    if needed:
+        print(f"For the defaults: {install(*needed)}")
+    if set(absent) - set(needed):
+        print(f"For {'the rest' if needed else 'what is missing'}: {install(*(e for e in absent if e not in needed))}")
     if not cfg.save:
         return
     folder = run_folder()
@@ -125,18 +116,34 @@ def run(cfg: DictConfig) -> None:
             "rays": rays is True,
             "sgbm": sgbm is True,
             "gl": bool(backends),
-            "cuda": cuda,
+            "cuda": torch.cuda.is_available(),
+            "missing": absent,
             "compiler": bool(compiler),
             "threads": torch.get_num_threads(),
         },
     )
 
 
-def _version(distribution: str) -> str:
-    try:
-        return importlib.metadata.version(distribution)
-    except importlib.metadata.PackageNotFoundError:
-        return ""
+def _extra(name: str) -> Finding:
+    """An extra: the packages of it that are there, or what it would bring."""
+    brings, packages = EXTRAS[name]
+    there = [f"{kind} {version(kind)}".rstrip() for module, kind in packages.items() if is_there(module)]
+    complete = len(there) == len(packages)
+    return Finding(f"[{name}]", ", ".join(there), brings if complete else f"{brings}: {install(name)}")
+
+
+def _devices() -> list[Finding]:
+    """Where tensors can be computed besides the CPU, and where networks in files can run."""
+    cuda = [torch.cuda.get_device_properties(k) for k in range(torch.cuda.device_count())]
+    found = [Finding(f"cuda:{k}", d.name, f"{d.total_memory / 2**30:.0f} GiB: device=cuda") for k, d in enumerate(cuda)]
+    if not found:
+        found = [Finding("CUDA", "", "everything runs on the CPU")]
+    if is_there("onnxruntime"):
+        import onnxruntime
+
+        names = [name.removesuffix("ExecutionProvider") for name in onnxruntime.get_available_providers()]
+        found.append(Finding("matcher=onnx", ", ".join(names), "runs on"))
+    return found
 
 
 def _compiler() -> str:

@@ -26,6 +26,7 @@ from omegaconf.errors import (
 )
 from yaml import YAMLError
 
+from torchfovea.commands.shared.extras import extra_of, install
 from torchfovea.setting import SettingError, require
 
 __all__ = ["arranged", "closest", "describe", "need", "setting_names"]
@@ -35,20 +36,6 @@ VALUED = ("--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd",
           "--experimental-rerun")  # fmt: skip
 PLAIN = ("--help", "-h", "--hydra-help", "--run", "-r", "--multirun", "-m", "--resolve", "--shell-completion", "-sc")
 INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
-
-# The extra that brings each optional module.
-EXTRAS = {
-    "cv2": "stereo",
-    "matplotlib": "viz",
-    "mujoco": "sim",
-    "skimage": "samples",
-    "cma": "tune",
-    "optuna": "tune",
-    "gymnasium": "rl",
-    "stable_baselines3": "ppo",
-    "onnxruntime": "onnx",
-    "rerun": "rerun",
-}
 
 # settings that are gone, and what does their work
 RENAMED = {
@@ -218,10 +205,8 @@ def _instantiation(error: InstantiationException, overrides: Sequence[str]) -> s
 
 def _missing_module(error: ModuleNotFoundError) -> str | None:
     module = (error.name or "").partition(".")[0]
-    if module not in EXTRAS:
-        return None
-    extra = EXTRAS[module]
-    return f"{module} is not installed: expected the extra {extra} (pip install 'torchfovea[{extra}]')"
+    extra = extra_of(module)
+    return None if extra is None else f"{module} is not installed: expected the extra {extra} ({install(extra)})"
 
 
 def _broken(error: YAMLError) -> str:
