@@ -48,7 +48,7 @@ def test_the_extras_are_those_of_the_package():
 def test_what_is_missing_is_named_with_the_line_that_installs_it(gone, said, capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(extras.importlib.util, "find_spec", lambda module: None if module in gone else module)
-    monkeypatch.setattr(doctor, "_devices", lambda: [])
+    monkeypatch.setattr(doctor, "_devices", lambda timeout_s: [])
     monkeypatch.setattr(
         doctor, "_probe", lambda program, timeout_s: (["egl"] if "available_gl" in program else True, "")
     )

@@ -55,6 +55,12 @@ print(json.dumps(available_gl()))
 """
 
 
+PROVIDERS = """
+import json, onnxruntime
+print(json.dumps([name.removesuffix("ExecutionProvider") for name in onnxruntime.get_available_providers()]))
+"""
+
+
 class Finding(NamedTuple):
     """A row of the table: what was looked for, what was found (empty: nothing), and what to know about it."""
 
@@ -92,7 +98,7 @@ def run(cfg: DictConfig) -> None:
         *(Finding(name, version(name), "" if version(name) else "needed") for name in REQUIRED),
         *(_extra(name) for name in EXTRAS),
         Finding("threads", str(torch.get_num_threads()), f"{os.cpu_count()} processors; OMP_NUM_THREADS sets them"),
-        *_devices(),
+        *_devices(timeout_s),
         Finding("C++ compiler", compiler, "" if compiler else "only torch.compile needs one"),
         Finding("renderer=rays", "works" if rays else "", rays_error),
         Finding("renderer=gl", ", ".join(backends), gl_error if not backends else ""),
@@ -132,17 +138,15 @@ def _extra(name: str) -> Finding:
     return Finding(f"[{name}]", ", ".join(there), brings if complete else f"{brings}: {install(name)}")
 
 
-def _devices() -> list[Finding]:
+def _devices(timeout_s: float) -> list[Finding]:
     """Where tensors can be computed besides the CPU, and where networks in files can run."""
     cuda = [torch.cuda.get_device_properties(k) for k in range(torch.cuda.device_count())]
     found = [Finding(f"cuda:{k}", d.name, f"{d.total_memory / 2**30:.0f} GiB: device=cuda") for k, d in enumerate(cuda)]
     if not found:
         found = [Finding("CUDA", "", "everything runs on the CPU")]
     if is_there("onnxruntime"):
-        import onnxruntime
-
-        names = [name.removesuffix("ExecutionProvider") for name in onnxruntime.get_available_providers()]
-        found.append(Finding("matcher=onnx", ", ".join(names), "runs on"))
+        names, error = _probe(PROVIDERS, timeout_s)
+        found.append(Finding("matcher=onnx", ", ".join(str(name) for name in names or []), error or "where it can run"))
     return found
 
 
