@@ -21,14 +21,27 @@ def on_config(config: MkDocsConfig) -> None:
             section["Guides"] += arrived
         if "Reference" in section:
             section["Reference"] = [OVERVIEW, *(f"reference/{name}.md" for name in rooms())]
+        if "Examples" in section:
+            section["Examples"] = [f"examples/{path.stem}.md" for path in sorted((ROOT / "examples").glob("*.py"))]
 
 
 def on_files(files: Files, config: MkDocsConfig) -> None:
     """Make the pages that are not written but follow."""
     made = {"index.md": of_the_site("README.md"), "changes.md": of_the_site("CHANGELOG.md"), OVERVIEW: front_door()}
     made |= {f"reference/{name}.md": page_of(name, modules) for name, modules in rooms().items()}
+    made |= {f"examples/{path.stem}.md": shown(path) for path in sorted((ROOT / "examples").glob("*.py"))}
     for uri, text in made.items():
         files.append(File.generated(config, uri, content=text))
+
+
+def on_page_markdown(markdown: str, **_: object) -> str:
+    """Lead to the site's own page of an example."""
+    return re.sub(r"\]\((?:\.\./)+examples/(\w+)\.py\)", r"](examples/\1.md)", markdown)
+
+
+def shown(path: Path) -> str:
+    """An example as a page."""
+    return f"# {path.name}\n\n`examples/{path.name}`\n\n```python\n{path.read_text(encoding='utf-8').rstrip()}\n```\n"
 
 
 def of_the_site(name: str) -> str:

@@ -25,7 +25,9 @@ EXTRAS = {
     "sim": Extra("simulated worlds: search, and most else", {"mujoco": "mujoco"}),
     "stereo": Extra("matcher=sgbm, the default of search", {"cv2": "opencv-python-headless"}),
     "viz": Extra("pictures", {"matplotlib": "matplotlib"}),
-    "samples": Extra("a real pair: sense pair=motorcycle", {"skimage": "scikit-image"}),
+    "samples": Extra(
+        "a real pair and digits: sense pair=motorcycle", {"skimage": "scikit-image", "sklearn": "scikit-learn"}
+    ),
     "sweep": Extra(
         "sweeps on all cores, or on a cluster",
         {
