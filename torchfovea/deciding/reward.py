@@ -22,7 +22,6 @@ __all__ = [
     "RewardBelief",
     "inverse_range_from_range",
     "inverse_range_reward",
-    "nearest_of_colour",
     "nearest_to",
     "of_class",
     "range_from_inverse_range",
@@ -134,7 +133,7 @@ def user_reward(function: Callable[[Tensor], Tensor], gaussian: Gaussian, method
 
     Args:
         function: maps points (..., 3) [m] to rewards (...), each from its own point; with the unscented transform it
-            is called once on (7, ..., 3). It may use its own tensors that broadcast to (...), as `nearest_of_colour`.
+            is called once on (7, ..., 3). It may use its own tensors that broadcast to (...).
         gaussian: mean (..., 3), packed cov (..., 6), positive semi-definite.
         method: `first_order` (mean r(μ), std √(JᵀΣJ), J by automatic differentiation) or `unscented` (sigma points at
             ±√3 standard deviations, exact in the mean for cubic rewards).
@@ -173,27 +172,6 @@ def nearest_to(point: Tensor) -> Callable[[Tensor], Tensor]:
         The function, with gradient 0 at the point itself.
     """
     return lambda x: -_norm(x - point)
-
-
-def nearest_of_colour(
-    appearance: Tensor, colour: Tensor, metres_per_difference: float = 5.0
-) -> Callable[[Tensor], Tensor]:
-    """The reward r(x) = −‖x‖ − m ‖appearance − colour‖ [m]: the nearest thing of a colour; for `user_reward`.
-
-    Args:
-        appearance: each cell's mean appearance in any number of channels, (..., N, C).
-        colour: the one sought, (C,).
-        metres_per_difference: m ≥ 0, how many metres a unit of difference in appearance outweighs.
-
-    Returns:
-        The function, of points (..., N, 3).
-
-    Raises:
-        SettingError: a negative m.
-    """
-    require(metres_per_difference >= 0, "metres_per_difference", metres_per_difference, "a number of at least 0")
-    penalty = metres_per_difference * _norm(appearance - colour)
-    return lambda x: -_norm(x) - penalty
 
 
 def _checked(reward: Tensor, points: Tensor) -> Tensor:
