@@ -119,6 +119,12 @@ def reconstruct(numbers):
     return tf.reconstruct(values, retina, numbers.pick(20, (3, 9), 0, -1))
 
 
+def interpolate(numbers):
+    retina = numbers.pick(*RETINAS)
+    values = torch.rand(2, 1, retina.count, generator=numbers.generator).to(numbers.dtype)
+    return tf.interpolate(values, retina, numbers.tensor(2, scale=numbers.pick(10.0, 10.0, 1e4)))
+
+
 def remember(numbers):
     observed = tf.observe(numbers.matches(5), numbers.eyes(), CAMERAS[0], numbers.positive(5))
     return tf.remember(memory(), observed, tf.Fusion())
@@ -138,6 +144,7 @@ FUZZED = {
     "belief": lambda n: tf.belief(memory()),
     "cartesian_belief": lambda n: tf.cartesian_belief(memory()),
     "choose": lambda n: tf.choose(n.tensor(n.pick(5, 0, 1)), n.mask(5), n.pick(None, n.generator)),
+    "cortical": lambda n: tf.cortical(n.tensor(n.pick(RETINAS[0].count, 7)), RETINAS[0]),
     "cyclopean": lambda n: tf.cyclopean(tf.Head(), n.gaze()),
     "decide": lambda n: tf.decide(OBSERVER, memory(), n.generator, n.pick(None, n.gaze()))[:2],
     "direction_mixture": mixture,
@@ -146,6 +153,7 @@ FUZZED = {
     "fixate": lambda n: tf.fixate(tf.Head(), n.tensor(n.pick(3, 3, 3, 2))),
     "forget": lambda n: tf.forget(memory(), n.pick(0.5, 1.0, 0.0, -1.0, math.nan)),
     "fovea": fovea,
+    "interpolate": interpolate,
     "log_density": lambda n: tf.log_density(
         tf.direction_mixture([1.0], [[1.0, 0.0, 0.0]], [[0.1, 0.2, 0.3]], dtype=n.dtype), n.tensor(3, scale=1.0)
     ),
@@ -157,6 +165,7 @@ FUZZED = {
         n.matches(5), n.eyes(), n.pick(*CAMERAS), n.positive(5), chart=n.pick("inverse_range", "cartesian", "polar")
     ),
     "perceive": lambda n: tf.perceive(OBSERVER, memory(), n.matches(7), n.eyes()),
+    "place_features": lambda n: tf.place_features(n.pick(*RETINAS), n.pick(3, 0, -1), dtype=n.pick(None, n.dtype)),
     "reconstruct": reconstruct,
     "remember": remember,
     "resample": lambda n: tf.resample(memory(), n.tensor(6, 3), tf.Fusion()),
@@ -170,6 +179,7 @@ FUZZED = {
     "upper_confidence_bound": lambda n: tf.upper_confidence_bound(
         n.tensor(5), n.positive(5), n.pick(1.0, 0.0, n.tensor())
     ),
+    "wrap_around": lambda n: tf.wrap_around(n.tensor(3, 5), n.pick(0, 1, 4, -1), n.pick(0, 1, 5, 6, -1)),
     "camera": lambda n: (lambda c: (c.rays(n.tensor(4, 2)), c.project(n.tensor(4, 3))))(n.pick(*CAMERAS)),
     "metrics": lambda n: (
         metrics.gap(n.tensor(n.pick(4, 0)), n.tensor()), metrics.regret(n.tensor(4), n.tensor()),
@@ -182,6 +192,7 @@ FUZZED = {
     ),
 }  # fmt: skip
 ELSEWHERE = {
+    "compiled": "the same functions again: test_compiling",
     "load_memory": "damaged files: test_store",
     "save_memory": "test_store",
 }
