@@ -18,7 +18,7 @@ ROOMS = {"sensing", "stereo", "memory", "deciding", "studies"}
 
 # From the ground up. A module imports from its own floor (never in a circle) or from those below it.
 FLOORS = (
-    ("setting", "files", "imported", "compiling", "finite"),
+    ("setting", "files", "untrusted", "imported", "compiling", "finite"),
     ("gaussian",),
     (
         "camera",
@@ -117,8 +117,7 @@ ONLY_IN = {
     "cv2": {
         "sgbm",
         "sparse",
-        "disparity_files",
-        "calibration_content",
+        "untrusted",
         "calibration_formats",
         "recordings",
         "commands",

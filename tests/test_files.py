@@ -1,16 +1,29 @@
 """Files appear whole or not at all, and say nothing that JSON or a table cannot hold."""
 
 import csv
+import errno
 import json
 import math
 import os
 import stat
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from torchfovea.files import replacing, write_csv, write_figure, write_json, write_result
+from torchfovea.files import (
+    clear_unfinished,
+    create_json,
+    replacing,
+    write_csv,
+    write_figure,
+    write_json,
+    write_result,
+    write_tensors,
+)
 
 
 def entries(folder):
@@ -106,3 +119,46 @@ def test_figure_is_a_png(tmp_path):
     write_figure(tmp_path / "f.png", Figure(figsize=(1, 1)), dpi=20)
     assert (tmp_path / "f.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     assert entries(tmp_path) == ["f.png"]
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda p: write_json(p, {"a": 1}),
+        lambda p: create_json(p, {"a": 1}),
+        lambda p: write_csv(p, ["a"], [(1,)]),
+        lambda p: write_tensors(p, {"a": torch.zeros(3)}),
+    ],
+    ids=["json", "new json", "csv", "tensors"],
+)
+def test_no_space_left_names_the_file_and_leaves_nothing(tmp_path, monkeypatch, write):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    for name in ("write_text", "write_bytes", "open"):
+        monkeypatch.setattr(type(tmp_path), name, full)
+    with pytest.raises(OSError, match=r"No space left on device.*it\.out"):
+        write(tmp_path / "it.out")
+    assert entries(tmp_path) == []
+
+
+def test_what_a_killed_writer_left_is_cleared_away_and_what_one_writes_is_not(tmp_path):
+    script = (
+        "import sys, time; from torchfovea.files import replacing\n"
+        "with replacing(sys.argv[1]) as it: it.write_text('half'); print(it, flush=True); time.sleep(600)"
+    )
+    started = [
+        subprocess.Popen([sys.executable, "-c", script, str(tmp_path / "x" / name)], stdout=subprocess.PIPE, text=True)
+        for name in ("a.csv", "b.csv")
+    ]
+    try:
+        dead, alive = (Path(process.stdout.readline().strip()) for process in started)
+        started[0].kill()
+        started[0].wait()
+        (tmp_path / ".unfinished-folder").mkdir()
+        clear_unfinished(tmp_path)
+        assert not dead.exists() and alive.read_text() == "half"
+    finally:
+        for process in started:
+            process.kill()
+            process.communicate()

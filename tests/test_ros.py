@@ -1,6 +1,7 @@
 """ROS 2 messages without ROS, and bags read as recordings."""
 
 import math
+import random
 from types import SimpleNamespace as Message
 
 import numpy as np
@@ -261,3 +262,19 @@ def test_a_bags_frames_that_cannot_be_used(bag):
     assert [frame.left is None for frame in frames] == [False, True, True, False]
     assert "frame 1: joint neck_pan = nan: expected a finite angle" in lines[0]
     assert "frame 2: stamp = 1.000: expected at least 1.250, the frame's before: time runs backward" in lines[1]
+
+
+def test_a_damaged_bag_is_one_line_or_a_recording(bag):
+    path = bag()
+    content = next(file for file in path.iterdir() if file.suffix in (".mcap", ".db3"))
+    whole, source, refused = content.read_bytes(), random.Random(0), 0
+    for _ in range(60):
+        at = source.randrange(len(whole))
+        wrong = whole[:at], whole[:at] + source.randbytes(8) + whole[at + 8 :], whole[:at] + whole[at + 40 :]
+        content.write_bytes(source.choice(wrong))
+        try:
+            assert len(list(Bag(path, T).frames(lambda error: None))) <= 4
+        except SettingError as error:
+            refused += 1
+            assert "\n" not in str(error) and "expected" in str(error)
+    assert refused > 20

@@ -307,9 +307,18 @@ def test_training_gains_resumes_and_never_ends_below_its_start(tmp_path):
     }.items():  # fmt: skip
         with pytest.raises(SettingError, match=f"checkpoint {name} = "):
             train(Problem(other, p.distribution, p.shape, p.cells), start, schedule, tmp_path / "part.pt")
-    (tmp_path / "bad.pt").write_bytes(b"no checkpoint")
-    with pytest.raises(SettingError, match=r"bad\.pt"):
-        train(p, start, schedule, tmp_path / "bad.pt")
+    kept = torch.load(tmp_path / "part.pt", weights_only=True)
+    for name, wrong in {
+        "vector": torch.full_like(start, torch.nan), "first": torch.zeros(2), "best": "abc", "history": [],
+        "curve": None, "step": 99, "best_value": None, "episodes": math.inf, "unknown": 1,
+    }.items():  # fmt: skip
+        torch.save({**kept, "state": {**kept["state"], name: wrong}}, tmp_path / "bad.pt")
+        with pytest.raises(SettingError, match=r"checkpoint = .*bad\.pt: expected a checkpoint of torchfovea tune"):
+            train(p, start, schedule, tmp_path / "bad.pt")
+    for content in (b"no checkpoint", b"", (tmp_path / "part.pt").read_bytes()[:-200]):
+        (tmp_path / "bad.pt").write_bytes(content)
+        with pytest.raises(SettingError, match=r"bad\.pt"):
+            train(p, start, schedule, tmp_path / "bad.pt")
 
 
 def test_a_step_that_is_not_finite_stops_and_keeps_the_checkpoint(tmp_path, monkeypatch):

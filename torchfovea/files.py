@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
 import os
@@ -12,7 +13,24 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-__all__ = ["create_json", "replacing", "write_csv", "write_figure", "write_json", "write_result"]
+try:
+    import fcntl
+except ImportError:  # not on Windows
+    fcntl = None  # type: ignore[assignment]
+
+__all__ = [
+    "clear_unfinished",
+    "create_json",
+    "replacing",
+    "write_csv",
+    "write_figure",
+    "write_json",
+    "write_result",
+    "write_tensors",
+]
+
+
+UNFINISHED = ".unfinished-"
 
 
 @contextmanager
@@ -26,20 +44,66 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         A path in the same folder with the same suffix (writers that go by the suffix work).
 
     Raises:
-        OSError: if the folder cannot be written. After any error inside the block ``path`` is as it was.
+        OSError: if the folder cannot be written, or has no space left; it names ``path``. After any error inside the
+            block ``path`` is as it was.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
-    os.close(handle)
-    temporary = Path(name)
-    try:
+    with _named(path), _temporary(path) as temporary:
         yield temporary
         _open_to_others(temporary)
         os.replace(temporary, path)
+
+
+@contextmanager
+def _temporary(path: Path) -> Iterator[Path]:
+    """A file beside a path, locked for as long as its writer lives, so that `clear_unfinished` knows what was left."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    while True:
+        handle, name = tempfile.mkstemp(prefix=f"{UNFINISHED}{path.stem}-", suffix=path.suffix, dir=path.parent)
+        if _locked(handle) and os.path.exists(name):
+            break
+        os.close(handle)  # somebody cleared it away before it was locked
+    if fcntl is None:
+        os.close(handle)  # Windows would neither rename nor remove an open file
+    try:
+        yield Path(name)
     finally:
         with suppress(FileNotFoundError):
-            temporary.unlink()
+            os.unlink(name)
+        if fcntl is not None:
+            os.close(handle)
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Name the file in errors of the system that do not: no space left on which device?"""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None:
+            error.filename = str(path)
+        raise
+
+
+def _locked(handle: int) -> bool:
+    """Whether a file is ours now; where files cannot be locked it always is."""
+    if fcntl is None:
+        return True
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        return True
+    return True
+
+
+def clear_unfinished(folder: Path) -> None:
+    """Remove the temporary files that writers who were killed have left in a folder or below it."""
+    for path in folder.rglob(f"{UNFINISHED}*") if fcntl is not None else ():
+        with suppress(OSError), path.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            path.unlink()
 
 
 def _open_to_others(path: Path) -> None:
@@ -89,17 +153,13 @@ def create_json(path: str | os.PathLike[str], content: Any) -> bool:
         Whether it was written.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(_json(content))
-        _open_to_others(Path(name))
-        os.link(name, path)
-    except FileExistsError:
-        return False
-    finally:
-        os.unlink(name)
+    with _named(path), _temporary(path) as temporary:
+        temporary.write_text(_json(content), encoding="utf-8")
+        _open_to_others(temporary)
+        try:
+            os.link(temporary, path)
+        except FileExistsError:
+            return False
     return True
 
 
@@ -138,3 +198,13 @@ def write_figure(path: str | os.PathLike[str], figure: Any, **options: Any) -> N
     """Write a matplotlib figure in the format of the path's suffix; ``options`` go to its ``savefig``."""
     with replacing(path) as temporary:
         figure.savefig(temporary, **options)
+
+
+def write_tensors(path: str | os.PathLike[str], content: Any) -> None:
+    """Write what `torchfovea.untrusted.read_tensors` reads: tensors, numbers, text, and collections of them."""
+    import torch
+
+    memory = io.BytesIO()  # torch's own writer words a full disk as an error of its own, without a name
+    torch.save(content, memory)
+    with replacing(path) as temporary:
+        temporary.write_bytes(memory.getbuffer())

@@ -14,6 +14,7 @@ from torchfovea.files import replacing
 from torchfovea.gaussian import Information, columns, positive_definite
 from torchfovea.memory.egosphere import Memory, Prior, empty_memory
 from torchfovea.setting import SettingError, require
+from torchfovea.untrusted import read_arrays
 
 __all__ = ["check_memory_path", "load_memory", "save_memory"]
 
@@ -66,8 +67,7 @@ def load_memory(path: str | os.PathLike[str], setting: str = "path") -> Memory:
         SettingError: for a file that is missing, damaged or no memory.
     """
     try:
-        with open(path, "rb") as handle, np.load(handle, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+        arrays = read_arrays(path)
         parts = {name: torch.from_numpy(arrays[name]) for name in _ENDS}
         names = (field.name for field in fields(Prior))
         prior = Prior(**{name: float(number) for name, number in zip(names, arrays["prior"], strict=True)})

@@ -137,7 +137,7 @@ class Bag:
     @contextmanager
     def _open(self) -> Iterator[Any]:
         try:
-            from rosbags.highlevel import AnyReader, AnyReaderError
+            from rosbags.highlevel import AnyReader
             from rosbags.typesys import Stores, get_typestore
         except ImportError:
             raise SettingError(
@@ -146,8 +146,11 @@ class Bag:
         try:
             with AnyReader([self.path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
                 yield reader
-        except (AnyReaderError, OSError) as error:
-            raise SettingError(f"recording = {self.path}: expected a ROS 2 bag that can be read ({error})") from error
+        except SettingError:
+            raise
+        except Exception as error:  # rosbags reads bytes as they come: a damaged bag fails anywhere
+            why = " ".join(str(error).split())[:160] or type(error).__name__
+            raise SettingError(f"recording = {self.path}: expected a ROS 2 bag that can be read ({why})") from error
 
     def _messages(self, reader: Any, topics: Mapping[str, object]) -> Iterator[tuple[str, Any]]:
         some = [c for c in reader.connections if c.topic in topics]

@@ -110,10 +110,13 @@ class Folder:
         self._table = self.folder / "frames.csv"
         require(self._table.is_file(), "recording", self.folder, "a folder with frames.csv, or a bag")
         self.calibration = read_calibration(self.folder / "calibration.json")
-        with self._table.open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file)
-            given = reader.fieldnames or []
-            self._rows = list(reader)
+        try:
+            with self._table.open(newline="", encoding="utf-8") as file:
+                reader = csv.DictReader(file)
+                given = reader.fieldnames or []
+                self._rows = list(reader)
+        except (csv.Error, UnicodeDecodeError) as error:
+            raise SettingError(f"recording = {self._table}: expected a table of frames ({error})") from error
         missing = [name for name in _IMAGES if name not in given]
         require(
             not missing, f"{self._table}: columns", ", ".join(given), f"{', '.join(_IMAGES)}, and what else is known"

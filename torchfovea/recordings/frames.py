@@ -111,7 +111,7 @@ def read_calibration(path: Path) -> Calibration:
         head = None if content.get("head") is None else _head(content["head"])
     except SettingError as error:
         raise SettingError(f"{path}: {error}") from None
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         what = f"no {error}" if isinstance(error, KeyError) else str(error)
         raise SettingError(f"{path} = {what}: expected size_px, left, right and head (docs/recordings.md)") from None
     require(width > 1 and height > 1, f"{path}: size_px", [width, height], "width and height of the images")

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchfovea.files import replacing
 from torchfovea.setting import SettingError, require
+from torchfovea.untrusted import Damaged, read_pixels
 
 __all__ = ["WHITE", "as_kept", "image_from_pixels", "read_picture", "write_picture"]
 
@@ -42,13 +43,11 @@ def read_picture(path: Path) -> Tensor:
     Raises:
         SettingError: for a file that is missing or no image.
     """
-    import cv2
-
     require(path.is_file(), "frame", path, "an image, but there is no such file")
-    loaded = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
-    if loaded is None:
-        raise SettingError(f"frame = {path}: expected an image that OpenCV can read")
-    return image_from_pixels(loaded)
+    try:
+        return image_from_pixels(read_pixels(path, ("COLOR", "ANYDEPTH")))
+    except Damaged as error:
+        raise SettingError(f"frame = {path}: expected an image that OpenCV can read ({error})") from error
 
 
 def image_from_pixels(pixels: np.ndarray) -> Tensor:

@@ -21,7 +21,8 @@ from torchfovea.recordings.pictures import image_from_pixels
 from torchfovea.recordings.poses import Pose, matrix_from_quaternion, step_between
 from torchfovea.sensing.camera import Pinhole
 from torchfovea.sensing.head import Gaze
-from torchfovea.setting import require
+from torchfovea.setting import SettingError, require
+from torchfovea.untrusted import Damaged, unpack_pixels
 
 __all__ = [
     "CloudData", "camera_from_info", "cloud_data", "gaze_from_joints", "image_from_message", "motion_from_odometry",
@@ -72,12 +73,12 @@ def image_from_message(message: Any) -> Tensor:
 
 
 def _decompressed(data: np.ndarray) -> Tensor:
-    import cv2
-
-    loaded = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
-    require(loaded is not None, "image", f"{len(data)} bytes", "a compressed image that OpenCV can read")
-    assert loaded is not None
-    return image_from_pixels(loaded)
+    try:
+        return image_from_pixels(unpack_pixels(data.tobytes(), ("COLOR", "ANYDEPTH")))
+    except Damaged as error:
+        raise SettingError(
+            f"image = {len(data)} bytes: expected a compressed image that OpenCV can read ({error})"
+        ) from error
 
 
 def camera_from_info(message: Any) -> tuple[Pinhole, tuple[int, int]]:

@@ -97,7 +97,7 @@ def described(paths: Sequence[Path], options: Options) -> Told:
         raise SettingError(f"calibration = {where}: expected {error.args[0]}, which it lacks") from error
     except (ValueError, TypeError, IndexError, AttributeError) as error:
         if isinstance(error, SettingError):
-            raise
+            raise SettingError(str(error) if where in str(error) else f"calibration = {where}: {error}") from error
         raise SettingError(f"calibration = {where}: expected numbers of a calibration ({error})") from error
     raise SettingError(
         f"calibration = {where}: expected Middlebury's or KITTI's calib.txt, OpenCV's YAML or XML, ROS's camera_info "

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.setting import SettingError, require
+from torchfovea.untrusted import Damaged, read_arrays, read_grey_pfm, read_pixels
 
 __all__ = ["check_maps", "load_disparity"]
 
@@ -41,13 +42,13 @@ def load_disparity(
     path = Path(path)
     require(path.is_file(), setting, path, "an existing file")
     suffix = path.suffix.lower()
-    readers = {".npz": _npz, ".npy": _npy, ".pfm": _pfm} | dict.fromkeys((".png", ".tif", ".tiff", ".pgm"), _image)
+    readers = {".npz": _arrays, ".npy": _arrays, ".pfm": _pfm} | dict.fromkeys(
+        (".png", ".tif", ".tiff", ".pgm"), _image
+    )
     require(suffix in readers, setting, path, f"a file that ends in {', '.join(readers)}")
     try:
         stored, sure = readers[suffix](path)
-    except SettingError:
-        raise
-    except (ValueError, OSError, IndexError, EOFError) as error:
+    except Damaged as error:
         raise SettingError(f"{setting} = {path}: expected a disparity map ({error})") from error
     disparity, confidence = check_maps(stored, sure, None, f"{setting} = {path}", span)
     if readers[suffix] is _image and stored.dtype.kind == "u":
@@ -62,43 +63,29 @@ def load_disparity(
     return disparity if unit_px is None else disparity * unit_px, confidence
 
 
-def _npz(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    with np.load(path, allow_pickle=False) as file:
-        names = file.files
-        key = "disparity" if "disparity" in names else names[0] if len(names) == 1 else None
-        if key is None:
-            raise ValueError(f"it holds {', '.join(names) or 'nothing'}, and no disparity")
-        return file[key], file["confidence"] if "confidence" in names else None
-
-
-def _npy(path: Path) -> tuple[np.ndarray, None]:
-    return np.load(path, allow_pickle=False), None
+def _arrays(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    arrays = read_arrays(path)
+    key = "disparity" if "disparity" in arrays else next(iter(arrays)) if len(arrays) == 1 else None
+    if key is None:
+        raise Damaged(f"it holds {', '.join(arrays) or 'nothing'}, and no disparity")
+    return arrays[key], arrays.get("confidence")
 
 
 def _pfm(path: Path) -> tuple[np.ndarray, None]:
-    with path.open("rb") as file:
-        kind, size, scale = (file.readline().decode("ascii", "replace").split() for _ in range(3))
-        if kind != ["Pf"]:
-            raise ValueError("it is no grey PFM")
-        width, height = map(int, size)
-        values = np.frombuffer(file.read(4 * width * height), "<f4" if float(scale[0]) < 0 else ">f4")
-    return values.reshape(height, width)[::-1].astype(np.float32), None
+    return read_grey_pfm(path), None
 
 
 def _image(path: Path) -> tuple[np.ndarray, None]:
     try:
-        import cv2
+        values = read_pixels(path)
     except ImportError as error:
         raise SettingError(
             f"{path}: expected OpenCV, which comes with pip install 'torchfovea[stereo]', to read an image"
         ) from error
-    values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if values is None:
-        raise ValueError("it is no image that OpenCV can read")
     if values.ndim == 3 and bool((values == values[..., :1]).all()):
         values = values[..., 0]
     if values.ndim != 2 or values.dtype not in (np.uint8, np.uint16, np.float32):
-        raise ValueError("it is no grey image of 8 or 16 bits, or of floating point")
+        raise Damaged("it is no grey image of 8 or 16 bits, or of floating point")
     return values, None
 
 

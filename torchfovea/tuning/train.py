@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import math
 import os
-import pickle
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchfovea.files import replacing
+from torchfovea.files import write_tensors
 from torchfovea.setting import SettingError, require
 from torchfovea.tuning.bias import fix_vector
 from torchfovea.tuning.estimators import Gradient, counterfactual, coverage, covered, fov_difference
@@ -20,6 +20,7 @@ from torchfovea.tuning.myopic import myopic
 from torchfovea.tuning.pathwise import pathwise
 from torchfovea.tuning.problem import Batch, Problem, evaluate_bias
 from torchfovea.tuning.scenes import stream
+from torchfovea.untrusted import read_tensors
 
 __all__ = ["ESTIMATORS", "Progress", "Schedule", "State", "gradient", "train"]
 
@@ -210,19 +211,34 @@ def _signature(schedule: Schedule, problem: Problem) -> dict[str, Any]:
 
 def _save(state: State, schedule: Schedule, problem: Problem, path: Path | None) -> None:
     if path is not None:
-        with replacing(path) as temporary:
-            torch.save({"state": state.__dict__, "made_with": _signature(schedule, problem)}, temporary)
+        write_tensors(path, {"state": state.__dict__, "made_with": _signature(schedule, problem)})
 
 
 def _load(problem: Problem, schedule: Schedule, path: Path) -> State:
+    expected = "a checkpoint of torchfovea tune"
     try:
-        content = torch.load(path, weights_only=True)
-        made_with, state = content["made_with"], State(**content["state"])
-    except (OSError, KeyError, TypeError, EOFError, RuntimeError, ValueError, pickle.UnpicklingError) as error:
-        raise SettingError(
-            f"checkpoint = {os.fspath(path)}: expected a checkpoint of torchfovea tune ({error})"
-        ) from error
+        content = read_tensors(path)
+        made_with, state = dict(content["made_with"]), State(**content["state"])
+        whole = _is_whole(state)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise SettingError(f"checkpoint = {os.fspath(path)}: expected {expected} ({error})") from error
+    require(whole, "checkpoint", os.fspath(path), f"{expected}, whose numbers are finite and belong together")
     now = _signature(schedule, problem)
     for name, value in now.items():
         require(made_with.get(name) == value, f"checkpoint {name}", made_with.get(name), f"the run's own, {value}")
+    fits = len(state.vector) == problem.shape.size
+    require(fits, "checkpoint", os.fspath(path), f"a vector of {problem.shape.size} numbers")
     return state
+
+
+def _is_whole(state: State) -> bool:
+    vectors = (state.vector, state.first, state.second, state.best)
+    counts = (state.episodes, state.best_value, state.step, state.runs)
+    return (
+        all(v.shape == state.vector.shape and v.dim() == 1 and bool(torch.isfinite(v).all()) for v in vectors)
+        and all(v.dtype == torch.float64 for v in vectors)
+        and all(math.isfinite(number) for number in counts)
+        and len(state.curve) == state.step
+        and len(state.history) > 0
+        and all(len(point) == 3 and len(point[2]) == len(state.vector) for point in state.history)
+    )

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchfovea.setting import SettingError, require
 from torchfovea.stereo.health import Fault, full_scale
+from torchfovea.untrusted import Damaged, read_arrays, unpack_pixels
 
 __all__ = ["Picture", "exposed", "read_levels"]
 
@@ -41,8 +42,6 @@ def read_levels(path: Path, setting: str) -> Picture:
     Raises:
         SettingError: for a file that is missing or cannot be read.
     """
-    import cv2
-
     require(path.is_file(), setting, path, "an existing file")
     turned = False
     if path.suffix.lower() in (".npy", ".npz"):
@@ -51,15 +50,15 @@ def read_levels(path: Path, setting: str) -> Picture:
         fits = pixels.ndim == 3 and pixels.shape[-1] == 3 and pixels.size > 0 and pixels.dtype.kind in "bfiu"
         require(fits, setting, (*pixels.shape, str(pixels.dtype)), "an array (H, W) or (H, W, 3) of numbers")
     else:
-        how = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
-        loaded = cv2.imread(str(path), how | cv2.IMREAD_IGNORE_ORIENTATION)
-        if loaded is None:
-            raise SettingError(f"{setting} = {path}: expected an image that OpenCV can read")
-        with path.open("rb") as file:
-            tagged = b"exif" in file.read(2**16).lower()
-        upright = cv2.imread(str(path), how) if tagged else None
-        turned = upright is not None and not np.array_equal(loaded, upright)
-        pixels = cv2.cvtColor(loaded, cv2.COLOR_BGR2RGB)
+        try:
+            data = path.read_bytes()
+            loaded = unpack_pixels(data, ("COLOR", "ANYDEPTH", "IGNORE_ORIENTATION"))
+            tagged = b"exif" in data[: 2**16].lower()
+            upright = unpack_pixels(data, ("COLOR", "ANYDEPTH")) if tagged else loaded
+        except Damaged as error:
+            raise SettingError(f"{setting} = {path}: expected an image that OpenCV can read ({error})") from error
+        turned = not np.array_equal(loaded, upright)
+        pixels = loaded[..., ::-1]
     nominal = NOMINAL.get(pixels.dtype, 1.0)
     levels = torch.from_numpy(np.ascontiguousarray(pixels, np.float32)).movedim(-1, 0)
     require(bool(torch.isfinite(levels).all()), setting, f"{path} with NaN or infinite pixels", "finite values")
@@ -90,7 +89,8 @@ def exposed(left: Picture, right: Picture) -> tuple[Tensor, Tensor, list[Fault]]
 
 def _array(path: Path, setting: str) -> np.ndarray:
     try:
-        loaded = np.load(path, allow_pickle=False)
-        return np.asarray(loaded if isinstance(loaded, np.ndarray) else loaded[loaded.files[0]])
-    except (ValueError, IndexError, OSError) as error:
-        raise SettingError(f"{setting} = {path}: expected a NumPy file with an array of numbers") from error
+        return next(iter(read_arrays(path).values()))
+    except (Damaged, StopIteration) as error:
+        raise SettingError(
+            f"{setting} = {path}: expected a NumPy file with an array of numbers ({error or 'it is empty'})"
+        ) from error

@@ -11,7 +11,7 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from torchfovea.files import create_json, replacing, write_json, write_result
+from torchfovea.files import clear_unfinished, create_json, replacing, write_json, write_result
 from torchfovea.setting import SettingError, require
 
 __all__ = ["MANIFEST", "complete", "config_hash", "finished", "read_result", "record", "unclaimed", "withdraw"]
@@ -37,7 +37,7 @@ def read_result(path: Path) -> dict[str, Any]:
     """
     try:
         result = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise SettingError(f"{path}: {error}: expected a run's result.json; remove it to run again") from None
     if not isinstance(result, dict):
         raise SettingError(f"{path} = {type(result).__name__}: expected a run's result.json; remove it to run again")
@@ -68,6 +68,7 @@ def finished(cfg: DictConfig, folder: Path, score: str = "gap_per_saccade") -> f
             "settings, another folder, or none"
         )
     if not result.exists():
+        clear_unfinished(folder)
         return None
     figures = read_result(result)
     value = figures.get(score)
@@ -119,6 +120,6 @@ def _read_manifest(path: Path) -> dict[str, Any]:
     try:
         manifest = json.loads(path.read_text(encoding="utf-8"))
         manifest["config_hash"]
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise SettingError(f"{path}: {error}: expected a run's manifest; remove the folder to run again") from None
     return dict(manifest)

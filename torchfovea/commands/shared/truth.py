@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from torchfovea.setting import SettingError, require
 from torchfovea.stereo.disparity_files import load_disparity
+from torchfovea.untrusted import Damaged, read_arrays, read_pixels
 
 __all__ = ["load_mask", "load_truth"]
 
@@ -53,18 +53,13 @@ def load_mask(path: Path, setting: str) -> tuple[Tensor, Tensor]:
     Raises:
         SettingError: for a file that is missing or no such map.
     """
-    import cv2
-
     require(path.is_file(), setting, path, "an existing file")
     try:
-        values = (
-            np.load(path, allow_pickle=False) if path.suffix == ".npy" else cv2.imread(str(path), cv2.IMREAD_ANYDEPTH)
-        )
-    except (ValueError, OSError, EOFError) as error:
-        raise SettingError(f"{setting} = {path}: expected an image or an NPY array ({error})") from error
-    fits = isinstance(values, np.ndarray) and values.ndim == 2 and values.size > 0 and values.dtype.kind in "bu"
+        values = next(iter(read_arrays(path).values())) if path.suffix == ".npy" else read_pixels(path, ("ANYDEPTH",))
+    except Damaged as error:
+        raise SettingError(f"{setting} = {path}: expected a grey image, or an NPY array (H, W) ({error})") from error
+    fits = values.ndim == 2 and values.size > 0 and values.dtype.kind in "bu"
     require(fits, setting, path, "a grey image, or an NPY array (H, W) of bool or unsigned whole numbers")
-    assert isinstance(values, np.ndarray)
     require(bool(values.any()), setting, path, "a mask that leaves something to judge")
     return torch.from_numpy(values > 0), torch.from_numpy(values == values.max())
 

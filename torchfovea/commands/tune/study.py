@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchfovea.commands.shared.build import whole
 from torchfovea.commands.shared.progress import progress_bar
-from torchfovea.files import replacing, write_csv
+from torchfovea.files import write_csv, write_tensors
 from torchfovea.setting import SettingError, require
 from torchfovea.tuning.baselines import TABLE_1, table_1
 from torchfovea.tuning.check import Sample, agreement, estimate_gradient, finite_differences, slope_along
@@ -33,6 +33,7 @@ from torchfovea.tuning.study import (
     student,
 )
 from torchfovea.tuning.train import ESTIMATORS, Schedule, State
+from torchfovea.untrusted import read_tensors
 
 __all__ = ["check_study", "study_curves", "study_gradients"]
 
@@ -138,9 +139,13 @@ def study_gradients(
             path = folder / "gradients" / f"{name}.pt"
             bar.update(job, advance=1, description=f"gradients  {name}")
             if not path.exists():
-                with replacing(path) as temporary:
-                    torch.save(tuple(make()), temporary)
-            return Sample(*torch.load(path, weights_only=True))
+                write_tensors(path, tuple(make()))
+            try:
+                parts, spent = read_tensors(path)
+                return Sample(parts.double(), float(spent))
+            except (ValueError, TypeError, AttributeError) as error:
+                expected = f"a gradient; remove it to estimate it again ({error})"
+                raise SettingError(f"gradients = {path}: expected {expected}") from error
 
         for point, x in (("start", start), ("target", target), ("middle", middle)):
             difference = made(f"{point}_differences", lambda x=x: finite_differences(problem, x, episodes))
