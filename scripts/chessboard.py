@@ -20,12 +20,13 @@ from torchfovea.commands.shared.budgets import load_budget
 from torchfovea.sensing.layout import LogPolar
 from torchfovea.stereo.calibration_files import load_calibration
 from torchfovea.stereo.matchers import Matcher
+from torchfovea.stereo.meeting import right_gaze_px
 from torchfovea.stereo.sgbm import SGBM
 from torchfovea.stereo.sweep import Sweep
 from torchfovea.stereo.views import posed_views
 
 CORNERS, SQUARE_M, SIZE = (9, 6), 0.025, (640, 480)
-RETINA = LogPolar(8000)
+RETINA, NEAREST_M = LogPolar(8000), 0.15
 
 
 def corners(path: Path) -> np.ndarray:
@@ -51,11 +52,13 @@ def main(folder: Path) -> None:
         away = normal @ torch.from_numpy(place.reshape(3))
         hull = cv2.convexHull(here)
         middles = [tuple(float(c) for c in found.mean((0, 1))) for found in (here, there)]
-        for gaze, name in ((None, "same pixel"), (middles[1], "board")):
-            images = (cv2.cvtColor(cv2.imread(str(p)), cv2.COLOR_BGR2RGB).transpose(2, 0, 1) for p in (path, other))
-            views = posed_views(*images, lens, calibration.right, calibration.rig, middles[0], gaze)
+        images = [cv2.cvtColor(cv2.imread(str(p)), cv2.COLOR_BGR2RGB).transpose(2, 0, 1) for p in (path, other)]
+        cameras = (lens, calibration.right, calibration.rig)
+        found = right_gaze_px(posed_views(*images, *cameras, middles[0]), NEAREST_M)
+        for gaze, name in ((None, "same pixel"), (found, "found"), (middles[1], "board")):
+            views = posed_views(*images, *cameras, middles[0], gaze)
             for params, budget in ((Sweep(), "log_polar_sweep"), (SGBM(), "log_polar_sgbm")):
-                matches, _ = Matcher(params, 0.15)(views, RETINA, load_budget(budget, views.source_px))
+                matches, _ = Matcher(params, NEAREST_M)(views, RETINA, load_budget(budget, views.source_px))
                 sensed = sense(views, RETINA, matches, None, True)
                 px = matches.left_px.double() * views.scale(RETINA) + torch.tensor(views.gaze_px)
                 on = torch.tensor([cv2.pointPolygonTest(hull, tuple(p), False) > 0 for p in px.tolist()])

@@ -53,6 +53,7 @@ FLOORS = (
         "readings",
         "surfaces",
         "sweep",
+        "meeting",
         "disparity_files",
         "calibration_content",
         "calibration_formats",

@@ -129,14 +129,21 @@ def files(stored, monkeypatch):
 
 
 def test_the_command_senses_a_raw_pair(room, files, capsys):
-    assert main(["sense", *files, "matcher=sgbm", "sensor.receptive_fields=3000"]) == 0, capsys.readouterr().err
-    run = Path(capsys.readouterr().out.splitlines()[-1])
+    assert main(["sense", *files, "matcher=sgbm", "sensor.receptive_fields=3000"]) == 0
+    told = capsys.readouterr()
+    run = Path(told.out.splitlines()[-1])
     result = json.loads((run / "result.json").read_text())
     with np.load(run / "points.npz") as points:
         seen = {k: torch.from_numpy(points[k]).double() for k in ("mean_m", "direction", "inverse_range")}
     assert result["valid_fraction"] > 0.9 and len(seen["mean_m"]) == result["points"] > 1000
     # in the left camera's frame, whatever the lens
     own = AHEAD @ turned(RIGS["verging"][0], 0, 0)
+    # the right retina looks at what the left one looks at
+    way = torch.nn.functional.normalize(LEFT.rays(torch.full((1, 2), (SIZE - 1) / 2, dtype=torch.float64)), dim=-1)
+    point = way * cast(room, HERE, way @ own.T).range_m[:, None]
+    there = RIGHT.project((point - ACROSS) @ turned(*RIGS["verging"][1]))[0]
+    assert torch.tensor(result["gaze_right_px"]) == pytest.approx(there, abs=2)
+    assert "the right retina looks at [{:.0f}, {:.0f}]".format(*result["gaze_right_px"]) in told.err
     hits = cast(room, HERE, seen["direction"] @ own.T)
     assert (seen["inverse_range"] - 1 / hits.range_m).abs().median() < 0.015  # most of it the chessboard's
     assert (run / "sense.png").exists() and (run / "points.ply").exists()
@@ -154,6 +161,7 @@ def test_the_command_senses_a_raw_pair(room, files, capsys):
         (["calibration_lens=thin"], "calibration_lens = thin: expected one of brown_conrady"),
         (["calibration_cameras=[1]"], r"calibration_cameras = [1]: expected [left, right]"),
         (["calibration_unit_m=0"], "calibration_unit_m = 0: expected metres"),
+        (["gaze_right_px=left"], "gaze_right_px = left: expected [column, row], a pixel of the 260x260 images, or"),
         (["gaze_right_px=[1,900]"], "gaze_right_px = [1, 900]: expected [column, row]"),
         (["calibration=3"], "calibration = 3: expected a file's name"),
         (["left=right.png", "right=left.png", "calibration_unit_m=-1"], "calibration_unit_m = -1"),

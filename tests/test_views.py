@@ -12,6 +12,7 @@ from torchfovea.setting import SettingError
 from torchfovea.stereo.external import External, match_external
 from torchfovea.stereo.matchers import Matcher
 from torchfovea.stereo.matching import match_sgbm
+from torchfovea.stereo.meeting import met
 from torchfovea.stereo.rectification import frame_to_match
 from torchfovea.stereo.rig import StereoRig, posed, verged
 from torchfovea.stereo.sgbm import SGBM
@@ -116,9 +117,9 @@ def test_eyes_that_look_at_one_thing_see_it_sharply(params):
     """With the right retina where the right eye sees what the left one fixates, no fovea looks at a periphery."""
     straight, rotation, shift = calibrated((95.0, 60.0))
     ray = straight.camera_left.rays(torch.tensor([95.0, 60.0], dtype=torch.float64))
-    met = straight.camera_right.project((ray * (AWAY / (ray @ NORMAL)) - shift) @ rotation)
-    views = posed_views(*straight[:5], straight.gaze_px, tuple(met.tolist()))
-    assert views.gazes_px == ((95.0, 60.0), tuple(met.tolist())) and views.whole().span_px >= straight.whole().span_px
+    there = straight.camera_right.project((ray * (AWAY / (ray @ NORMAL)) - shift) @ rotation)
+    views = posed_views(*straight[:5], straight.gaze_px, tuple(there.tolist()))
+    assert views.gazes_px == ((95.0, 60.0), tuple(there.tolist())) and views.whole().span_px >= straight.whole().span_px
     scores, away = [], straight._replace(gaze_right_px=(50.0, 100.0))
     for pair in (away, views):
         place, seen = truth(pair, rotation, shift, LogPolar(3000))
@@ -129,6 +130,21 @@ def test_eyes_that_look_at_one_thing_see_it_sharply(params):
     assert scores[1] < 0.1 / views.scale(RETINA) and scores[1] < 0.5 * scores[0]
     middle = views.cameras(RETINA)[1].project((ray * (AWAY / (ray @ NORMAL)) - shift) @ rotation)
     assert middle.abs().max() < 1e-9
+
+
+def test_a_glance_finds_where_the_right_eye_has_the_left_ones_thing():
+    straight, rotation, shift = calibrated((95.0, 60.0))
+    ray = straight.camera_left.rays(torch.tensor([95.0, 60.0], dtype=torch.float64))
+    there = straight.camera_right.project((ray * (AWAY / (ray @ NORMAL)) - shift) @ rotation)
+    found = met(straight, 0.5)
+    assert torch.tensor(found.gaze_right_px) == pytest.approx(there, abs=0.7)
+    assert found._replace(gaze_right_px=None) == straight
+    # what it sees to the left of the right image, it looks for at the border
+    border = met(straight._replace(gaze_px=(2.0, 60.0)), 0.5).gazes_px[1]
+    assert border[0] >= 0 and 50 < border[1] < 80
+    grey = torch.full_like(straight.left, 0.5)
+    blank = straight._replace(left=grey, right=grey)
+    assert met(blank, 0.5) == blank
 
 
 # ---------------------------------------------------------------------------------------------------- what it tells

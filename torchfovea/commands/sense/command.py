@@ -34,6 +34,7 @@ from torchfovea.stereo.external import External
 from torchfovea.stereo.health import misaligned
 from torchfovea.stereo.matchers import Match, Matcher, checked_matches
 from torchfovea.stereo.matching import match_sgbm
+from torchfovea.stereo.meeting import met
 from torchfovea.stereo.sgbm import SGBM
 from torchfovea.stereo.views import Views
 from torchfovea.studies.calibration import mixture_std
@@ -42,6 +43,7 @@ __all__ = ["Sensed", "run", "sense"]
 
 FRAME = "the left camera's frame: x right, y down, z forward"
 PLAIN_BYTES = 1_000_000_000
+_MET = "the right retina looks at [{:.0f}, {:.0f}], at the left one's thing (gaze_right_px=same: at the same pixel)"
 UNITS = "mean_m m, cov_m2 m^2, left_px retinal px, left_image_px px, inverse_range 1/m; direction has length 1"
 
 
@@ -71,12 +73,15 @@ def run(cfg: DictConfig) -> float | None:
     match, pair, health = build_match(cfg), load_pair(cfg), health_of(cfg)
     raw = retina is None and pair.rig is not None
     require(not raw, "sensor.layout", "every_pixel", "a retina (sensor=log_polar or uniform) for raw images")
-    gazes = [gaze_of(cfg, pair, name) for name in ("gaze_px", "gaze_right_px")]
-    views, budget = pair.views(*gazes), build_budget(cfg, pair=True)
-    views = views.whole() if choice(cfg, "span", ("whole", "shorter")) == "whole" else views
+    views, free = _looking(cfg, pair)
+    budget, whole = build_budget(cfg, pair=True), choice(cfg, "span", ("whole", "shorter")) == "whole"
     printed = choice(cfg, "budget.sigma_points", ("ours", "paper")) == "paper"
     found_out = examine(pair, views, health)
     pair, told = pair._replace(disparity=found_out.disparity), found_out.warnings
+    if free:
+        views = met(views, match.nearest_m if isinstance(match, Matcher) else 0.3)
+        _say(_MET.format(*views.gazes_px[1]))
+    views = views.whole() if whole else views
     budget, folder = misaligned(budget, found_out.rows_px), run_folder()
 
     matches, found = _matched(match, views, retina, budget)
@@ -85,6 +90,7 @@ def run(cfg: DictConfig) -> float | None:
         told += examine_map(found.disparity, found.valid, found_out.matches, views, health)
     sensed = sense(views, retina, matches, SigmaPoints.paper() if printed else None, not printed)
     _write(folder, sensed, views, retina)
+    right_px = views.gazes_px[1]
     # the truth is the left image's, wherever the right eye looked
     views = views._replace(rectified=pair.rig is None, gaze_right_px=None)
     # from here on nothing can lose the points
@@ -99,14 +105,30 @@ def run(cfg: DictConfig) -> float | None:
     from torchfovea.commands.sense.pictures import draw_sense
 
     draw_sense(folder / "sense.png", pair.left, found, retina, observed, matches.left_px)
-    write_result(folder, {**figures, "warnings": told})
+    write_result(folder, {**figures, "gaze_right_px": right_px, "warnings": told})
     grid = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     for name, value in figures.items():
         grid.add_row(name, f"{value:.4g}")
     Console().print(grid)
     for line in told:
-        Console(stderr=True, soft_wrap=True).print(f"sense: {line}", highlight=False, markup=False)
+        _say(line)
     return figures.get("median_error_m")
+
+
+def _looking(cfg: DictConfig, pair: Pair) -> tuple[Views, bool]:
+    """The pair with what its retinas look at, and whether the right one is free to look where the left one's thing is.
+
+    The eyes of a rectified pair look at the same pixel by themselves.
+    """
+    gaze = gaze_of(cfg, pair, "gaze_px")
+    if cfg.gaze_right_px == "same":
+        return pair.views(gaze), False
+    other = gaze_of(cfg, pair, "gaze_right_px")
+    return pair.views(gaze, other), other is None and pair.rig is not None
+
+
+def _say(line: str) -> None:
+    Console(stderr=True, soft_wrap=True).print(f"sense: {line}", highlight=False, markup=False)
 
 
 def _beside_plain(

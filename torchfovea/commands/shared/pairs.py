@@ -146,7 +146,7 @@ def gaze_of(cfg: DictConfig, pair: Pair, name: str = "gaze_px") -> tuple[float, 
     if given is None:
         return None
     height, width = pair.left.shape[-2:]
-    expected = f"[column, row], a pixel of the {width}x{height} images"
+    expected = f"[column, row], a pixel of the {width}x{height} images{', or same' * (name == 'gaze_right_px')}"
     two = OmegaConf.is_list(given) and len(given) == 2 and all(is_number(v) for v in given)
     require(two, name, given, expected)
     column, row = (float(v) for v in given)
