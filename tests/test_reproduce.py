@@ -205,6 +205,13 @@ def test_a_whole_reproduction_resumes_and_names_what_is_corrupt(tmp_path, capsys
     assert all(entry["id"] in report for entry in stated) and "data:image/png;base64," in report
     assert 'src="http' not in report and "<script" not in report
     assert report.index("Claims") < report.index("Fig. 8")
+    assert "width=device-width" in report and "<style>body{" in report
+    assert (
+        report.index("claims") < report.index("Claims</h2>") < report.index("Provenance") < report.index("Words</h2>")
+    )
+    assert "torchfovea reproduce " in report and "took no part" in report and " nats" in report
+    small = [entry for entry in stated if entry["verdict"] == "undecided" and entry["p_value"] is not None]
+    assert report.count("n too small to decide<") == len(small) > 0  # of two or three scenes none can decide
     lines = (folder / "episodes.csv").read_text().splitlines()
     assert len(lines) == 1 + result["episodes"] == 1 + 2 * (2 * 3 + 2)
 

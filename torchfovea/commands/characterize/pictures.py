@@ -27,6 +27,11 @@ __all__ = ["draw_advantage", "draw_fig5", "draw_layouts", "draw_propagation", "d
 STYLE = {"log_polar": "-", "uniform": "--"}
 COLOUR = {"log_polar": "tab:blue", "uniform": "tab:orange"}
 NAME = {"log_polar": "log-polar", "uniform": "uniform"}
+WAYS = {
+    "first_order": "first order",
+    "ut_paper": "unscented, the paper's weights",
+    "ut_default": "unscented, ours",
+}
 
 
 def draw_layouts(path: Path, retinas: Mapping[str, Retina], sigma_over_width: float) -> None:
@@ -75,7 +80,8 @@ def _curves(axes: Axes, grids: Mapping[str, Characterization], over: str) -> Non
             axes.plot(x, nats[k], STYLE[sensor], color=colour, lw=1.6, label=name)
     axes.set_ylabel("mean information over matched RFs [nats]")
     axes.grid(alpha=0.3)
-    axes.legend(title="vergence" if over == "distance" else "distance", fontsize=8)
+    title = "vergence" if over == "distance" else "distance"
+    axes.legend(title=title, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
 def draw_fig5(path: Path, grids: Mapping[str, Characterization], baseline_m: float, title: str) -> None:
@@ -165,7 +171,7 @@ def draw_propagation(
     for row, chart in zip(panels, charts, strict=True):
         for k, axes in enumerate(row):
             for way, marker in zip(ways, "osd^v", strict=False):
-                axes.plot(ratios, [v[k] for v in worst[chart, way]], marker=marker, label=way.replace("_", " "))
+                axes.plot(ratios, [v[k] for v in worst[chart, way]], marker=marker, label=WAYS.get(way, way))
             title = f"{chart.replace('_', ' ')}: {names[k]}"
             axes.set(yscale="log", ylim=(1e-4, 1), xlabel="e = σ_D/D", title=title)
             if k < 2:

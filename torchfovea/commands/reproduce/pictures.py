@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +29,11 @@ PANELS = (
     ("global_information_per_saccade", "global_information", "global information GI/S (Eq. 53) [nats]"),
     ("local_information_per_saccade", "local_information", "local information LI/S (Eq. 55) [nats]"),
 )
-COLOURS = {("log_polar", 90): "tab:blue", ("log_polar", 135): "tab:cyan", ("uniform", 90): "tab:red",
-           ("uniform", 135): "tab:orange"}  # fmt: skip
-BIASES = {"unbiased": "0.4", "top": "tab:red", "down": "tab:blue", "target": "tab:green", "aimed": "tab:green"}
+# after Okabe and Ito: told apart by every eye; the dashes tell them apart in grey
+BLUE, SKY, VERMILION, ORANGE, GREEN = "#0072B2", "#56B4E9", "#D55E00", "#E69F00", "#009E73"
+COLOURS = {("log_polar", 90): BLUE, ("log_polar", 135): SKY, ("uniform", 90): VERMILION, ("uniform", 135): ORANGE}
+BIASES = {"unbiased": "0.4", "top": VERMILION, "down": BLUE, "target": GREEN, "aimed": GREEN}
+DASHES = ("-", "--", "-.", ":")
 
 
 def _interval(values: Sequence[float]) -> tuple[float, float, float]:
@@ -60,6 +63,13 @@ def _panels(title: str) -> tuple[Figure, list[Axes]]:
     return figure, list(figure.subplots(2, 2).flat)
 
 
+def _legend_below(axes: Axes) -> None:
+    """A legend that covers no curve, below all panels."""
+    handles, labels = axes.get_legend_handles_labels()
+    if handles and isinstance(axes.figure, Figure):
+        axes.figure.legend(handles, labels, fontsize=9, ncols=len(handles), loc="outside lower center")
+
+
 def draw_arms(path: Path, rows: Rows, title: str) -> None:
     """Fig. 8a: the four metrics per saccade over the arms, for both sensors and fields of view, mean with 95% CI."""
     arms = list(dict.fromkeys(row["arm"] for row in sorted(rows, key=lambda r: _order(r["arm"]))))
@@ -78,9 +88,9 @@ def draw_arms(path: Path, rows: Rows, title: str) -> None:
                     ms=4, capsize=2, label=label,
                 )  # fmt: skip
         axes.set_xticks(range(len(arms)), [_label(arm) for arm in arms], rotation=45, ha="right")
-        axes.set_title(name, fontsize=10)
+        axes.set(xlabel="strategy", ylabel=name)
         axes.grid(axis="y", alpha=0.3)
-    panels[0].legend(fontsize=8)
+    _legend_below(panels[0])
     write_figure(path, figure, dpi=75)
 
 
@@ -94,17 +104,16 @@ def draw_course(path: Path, groups: Mapping[str, tuple[str, Rows]], title: str) 
     """Figs. 8b and 9b: the four metrics over time, mean with a band of 95% CI; groups are label: (colour, rows)."""
     figure, panels = _panels(title)
     for axes, (_, curve, name) in zip(panels, PANELS, strict=True):
-        for label, (colour, rows) in groups.items():
+        for dash, (label, (colour, rows)) in zip(cycle(DASHES), groups.items(), strict=False):
             band = _band(rows, curve)
             if band is None:
                 continue
             t = np.arange(1, len(band[0]) + 1)
-            axes.plot(t, band[0], color=colour, label=label)
+            axes.plot(t, band[0], dash, color=colour, label=label)
             axes.fill_between(t, band[1], band[2], color=colour, alpha=0.18, lw=0)
-        axes.set_title(name.replace("/S", "").replace(" (Eq. 49)", "").replace(" (Eq. 51)", ""), fontsize=10)
-        axes.set_xlabel("saccade t")
+        axes.set(xlabel="saccade t", ylabel=name.replace("/S", "").replace(" (Eq. 49)", "").replace(" (Eq. 51)", ""))
         axes.grid(alpha=0.3)
-    panels[0].legend(fontsize=8)
+    _legend_below(panels[0])
     write_figure(path, figure, dpi=75)
 
 
@@ -120,7 +129,7 @@ def draw_biases(path: Path, rows: Rows, title: str) -> None:
                 axes.bar(x, mean, color=BIASES[bias], alpha=0.75)
                 axes.errorbar(x, mean, [[max(mean - low, 0)], [max(high - mean, 0)]], color="0.1", capsize=4)
         axes.set_xticks(range(len(biases)), biases)
-        axes.set_title(name, fontsize=10)
+        axes.set(xlabel="bias of the memory", ylabel=name)
         axes.grid(axis="y", alpha=0.3)
     write_figure(path, figure, dpi=75)
 
@@ -137,7 +146,7 @@ def draw_vergences(path: Path, curves: Mapping[str, Any]) -> None:
         axes.axvline(math.degrees(float(curves["matched_rad"][i])), color=colour, lw=0.6, ls=":")
     axes.set(xlabel="vergence [°]", ylabel="mean information (Eq. 45) [nats]")
     axes.set_title("log-polar (solid), uniform (dashed), matched vergences (dotted)", fontsize=10)
-    axes.legend(fontsize=8)
+    axes.legend(fontsize=8, title="distance", loc="center left", bbox_to_anchor=(1.0, 0.5))
     axes.grid(alpha=0.3)
     write_figure(path, figure, dpi=75)
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import base64
 import html
+import json
+import platform
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,7 @@ import torch
 from torchfovea import __version__
 from torchfovea.commands.reproduce import pictures
 from torchfovea.commands.reproduce.claims import rows_where
+from torchfovea.commands.shared.manifest import MANIFEST
 from torchfovea.files import replacing, write_csv
 from torchfovea.studies.significance import bootstrap_interval
 
@@ -24,7 +27,28 @@ STYLE = """body{font:15px/1.45 system-ui,sans-serif;max-width:75em;margin:2em au
 table{border-collapse:collapse;width:100%;font-size:14px}th,td{text-align:left;vertical-align:top;padding:.35em .6em;
 border-bottom:1px solid #ddd}td.n{text-align:right;white-space:nowrap}.holds{color:#176b2c;font-weight:600}
 .fails{color:#a31515;font-weight:600}.undecided{color:#7a6200;font-weight:600}small{color:#555}img{max-width:100%}
-code{background:#f2f2f2;padding:0 .25em}"""
+code{background:#f2f2f2;padding:0 .25em}dt{font-weight:600}
+@media(max-width:50em){body{font-size:14px}table{display:block;overflow-x:auto}}"""
+
+LEVEL = 0.05  # of the verdicts
+UNITS = {
+    "global_information_per_saccade": "nats", "local_information_per_saccade": "nats", "regret_per_saccade": "m",
+    "target_error_m": "m", "saccades_to_target": "saccades", "regret_convergence": "saccades", "degrees_travelled": "°",
+}  # fmt: skip
+GLOSSARY = """<h2>Words</h2><dl>
+<dt>gap<dd>of the way from the first fixation's reward to the best possible one, the share that a search has come, 0 to
+1; per saccade: its mean over the saccades (Eq. 46-49)
+<dt>regret<dd>by how much the mean reward so far falls short of the best possible one [m] (Eq. 50-51)
+<dt>information<dd>&minus;log |&Sigma;| of what the memory believes [nats]; global: mean over all cells, local: over
+those within 0.1 m of the target (Eq. 52-55). 1 nat is 1.44 bits
+<dt>&alpha;, UCB, PI, EI<dd>strategies: mean plus &alpha; standard deviations, probability of improvement, expected
+improvement
+<dt>log-polar, uniform<dd>a foveal retina, and one whose receptive fields are all alike, with equally many of them
+<dt>bias<dd>where the memory's cells lie densely
+<dt>effect size<dd>mean difference over the scenes' standard deviation of it
+<dt>p (Holm)<dd>probability of so large a difference by chance, corrected for the number of claims
+<dt>n<dd>scenes; a claim is <i>undecided</i> where its interval and p leave both ways open
+</dl>"""
 
 
 def write_report(folder: Path, plain: Row, rows: list[Row], stated: list[Row], figures: Row, fig5: Row) -> None:
@@ -45,8 +69,11 @@ def write_report(folder: Path, plain: Row, rows: list[Row], stated: list[Row], f
     sections += _ablation(folder, rows, plain["level"])
     sections += _photometric(rows, plain["level"])
     parts = [
-        f"<!doctype html><html lang=en><meta charset=utf-8><title>torchfovea reproduce</title><style>{STYLE}</style>",
+        "<!doctype html><html lang=en><meta charset=utf-8>",
+        "<meta name=viewport content='width=device-width,initial-scale=1'>",
+        f"<title>torchfovea reproduce</title><style>{STYLE}</style>",
         "<h1>Foveal mechanisms in active stereo: the claims, measured again</h1>",
+        _summary(stated, figures),
         f"<p>torchfovea {__version__}; {figures['scenes']} scenes, "
         f"{figures['episodes']} episodes of {plain['saccades']} saccades, {plain['memory']['cells']} cells, "
         f"{plain['sensor']['sample'] or plain['sensor']['receptive_fields']} receptive fields a look. "
@@ -64,7 +91,7 @@ def write_report(folder: Path, plain: Row, rows: list[Row], stated: list[Row], f
     for title, drawn, text in sections:
         parts.append(f"<h2>{html.escape(title)}</h2>{text}")
         parts += [_inline(picture) for picture in drawn]
-    parts.append("</html>")
+    parts += [_provenance(folder, rows, figures), GLOSSARY, "</html>"]
     with replacing(folder / "report.html") as temporary:
         temporary.write_text("\n".join(parts), encoding="utf-8")
 
@@ -94,6 +121,48 @@ def _what_can(stated: list[Row]) -> str:
     return decidable(max(known), len(known)) if known else ""
 
 
+def _too_small(entry: Row, stated: list[Row]) -> bool:
+    """Whether so few scenes could not have decided a claim, had all of them agreed."""
+    tested = sum(other["p_value"] is not None for other in stated)
+    known = entry["verdict"] == "undecided" and entry["p_value"] is not None
+    return known and tested * 2.0 ** (1 - entry["n"]) > LEVEL
+
+
+def _summary(stated: list[Row], figures: Row) -> str:
+    """The outcome in a sentence, before any table."""
+    small = sum(_too_small(entry, stated) for entry in stated)
+    held, failed = (
+        [entry["text"].removeprefix("... ") for entry in stated if entry["verdict"] == verdict]
+        for verdict in ("holds", "fails")
+    )
+    lines = [
+        f"<p><b>Of {figures['claims']} claims {figures['claims_hold']} hold, {figures['claims_fail']} fail and "
+        f"{figures['claims_undecided']} are undecided</b>"
+        + (f", {small} of these because n is too small to decide them: run more scenes (episodes=)." if small else ".")
+    ]
+    for word, texts in (("Hold", held), ("Fail", failed)):
+        if texts:
+            lines.append(f"<br>{word}: {html.escape('; '.join(texts))}.")
+    return "".join([*lines, "</p>"])
+
+
+def _provenance(folder: Path, rows: list[Row], figures: Row) -> str:
+    """What it was made with, so that it can be made again; and the arms that took part."""
+    path = folder / MANIFEST
+    told = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    arms = ", ".join(sorted({str(row["arm"]) for row in rows if row.get("arm")}))
+    facts = {
+        "command": " ".join(["torchfovea reproduce", *told.get("overrides", [])]),
+        "settings": told.get("config_hash", "–"),
+        "software": f"torchfovea {__version__}, PyTorch {torch.__version__}, Python {platform.python_version()}",
+        "machine": f"{platform.system()} {platform.machine()}",
+        "time": f"{figures['seconds']:.0f} s for the episodes of this run",
+        "strategies that were run": f"{arms}; another that a definition names took no part",
+    }
+    cells = "".join(f"<tr><th>{name}<td><code>{html.escape(str(fact))}</code>" for name, fact in facts.items())
+    return f"<h2>Provenance</h2><table>{cells}</table>"
+
+
 def _number(value: Any) -> str:
     return "–" if value is None else f"{value:.3g}"
 
@@ -104,11 +173,13 @@ def _claims_table(stated: list[Row]) -> str:
         interval = "" if entry["ci_low"] is None else f"<br>{_number(entry['ci_low'])} to {_number(entry['ci_high'])}"
         places = [f"{place}: {verdict}" for place, verdict in entry.get("elsewhere", {}).items() if verdict]
         other = f"<br><small>elsewhere: {html.escape('; '.join(places))}</small>" if places else ""
+        small = "<br><small>n too small to decide</small>" if _too_small(entry, stated) else ""
+        unit = "" if entry["estimate"] is None else UNITS.get(entry["metric"], "")
         note = f". {entry['note']}" if entry.get("note") else ""
         lines.append(
             f"<tr><td>{html.escape(entry['text'])} <small>(Sec. {entry['section']}, {entry['id']})</small>"
             f"<br><small>{html.escape(entry['definition'])}{html.escape(note)}</small>{other}"
-            f"<td class={entry['verdict']}>{entry['verdict']}<td class=n>{shown(entry)}{interval}"
+            f"<td class={entry['verdict']}>{entry['verdict']}{small}<td class=n>{shown(entry)} {unit}{interval}"
             f"<td class=n>{_number(entry['effect_size'])}<td class=n>{_number(entry['p_holm'])}<td class=n>{entry['n']}"
         )
     return "\n".join([*lines, "</table>"])

@@ -200,13 +200,12 @@ def _draw(folder: Path, cfg: DictConfig, retina: Any, episode: Episode, row: tup
     from torchfovea.commands.search.pictures import draw_episode
 
     moves = row[EPISODE_COLUMNS.index("saccades_to_target")]
-    outcome = f"target fixated after {moves} saccades" if bool(episode.hit.any()) else "target not found"
-    draw_episode(
-        folder / "episode.png",
-        episode,
-        retina,
-        f"{cfg.scene.name}, {cfg.sensor.layout}, {cfg.sensor.fov_deg:g}°: {outcome}",
+    outcome = (
+        f"target fixated after {moves:g} saccade{'s' * (moves != 1)}" if bool(episode.hit.any()) else "target not found"
     )
+    scene, sensor = cfg.scene.name.replace("_", " "), cfg.sensor.layout.replace("_", "-")
+    title = f"{scene}, {sensor}, {cfg.sensor.fov_deg:g}°: {outcome}"
+    draw_episode(folder / "episode.png", episode, retina, title)
 
 
 def _print(figures: dict[str, Any]) -> None:

@@ -112,13 +112,15 @@ def draw_episode(path: Path, episode: Episode, retina: Retina, title: str) -> No
     row = next(parts).subplots(1, 3)
     t = np.arange(1, len(episode.gap) + 1)
     row[0].plot(t, episode.gap, color="tab:blue", marker=".")
-    row[0].set(title="gap (Eq. 46)", ylim=(-0.05, 1.05))
+    row[0].set(title="gap (Eq. 46)", ylabel="gap, 0 to 1", ylim=(-0.05, 1.05))
     row[1].plot(t, episode.regret, color="tab:red", marker=".")
-    row[1].set(title="regret (Eq. 50) [m]")
-    row[2].plot(t, episode.global_information, color="tab:purple", marker=".", label="global (Eq. 52)")
+    row[1].set(title="regret (Eq. 50)", ylabel="regret [m]")
+    row[2].plot(t, episode.global_information, color="#0072B2", marker=".", label="global (Eq. 52)")
     if episode.local_information is not None:
-        row[2].plot(t, episode.local_information, color="tab:green", marker=".", label="near the target (Eq. 54)")
-    row[2].set(title="information [nats]")
+        row[2].plot(
+            t, episode.local_information, color="#D55E00", marker="^", ls="--", label="near the target (Eq. 54)"
+        )
+    row[2].set(title="information", ylabel="information [nats]")
     row[2].legend()
     for axes in row:
         axes.set_xlabel("fixation t")

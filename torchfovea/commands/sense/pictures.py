@@ -42,11 +42,13 @@ def draw_sense(path: Path, left: Tensor, found: Any, retina: Retina | None, obse
     height, width = left.shape[-2:]
     extent = (-0.5, width - 0.5, height - 0.5, -0.5)
     axes[0, 0].imshow(np.asarray(left[:, ::step, ::step].movedim(0, -1)).clip(0, 1), extent=extent)
-    axes[0, 0].set_title("left image")
+    axes[0, 0].set(title="left image", xlabel="column [px]", ylabel="row [px]")
     if isinstance(found, Disparity | SweepRange):
         values, name = found_map(found, retina, min(*left.shape[-2:], SHOWN_PX))
         step = max(1, max(values.shape) // SHOWN_PX)
-        figure.colorbar(axes[0, 1].imshow(values[::step, ::step], cmap="viridis"), ax=axes[0, 1])
+        inner = np.nanquantile(values, (0.02, 0.98)) if np.isfinite(values).any() else (0.0, 1.0)  # false matches apart
+        drawn = axes[0, 1].imshow(values[::step, ::step], cmap="viridis", vmin=inner[0], vmax=inner[1])
+        figure.colorbar(drawn, ax=axes[0, 1], extend="both")
         axes[0, 1].set_title(name)
     keep = observed.valid & (observed.mean[:, 2] > 0)
     rho, sigma = observed.mean[keep, 2], observed.cov[keep, 5].sqrt()
@@ -64,7 +66,7 @@ def draw_sense(path: Path, left: Tensor, found: Any, retina: Retina | None, obse
             *px[keep].T, c=value, s=1.5, cmap=cmap, linewidths=0, norm="log" if log else None, rasterized=True
         )
         drawn.set_clim(low, max(high, low * 1.001 + 1e-9))
-        place.set(title=name, aspect="equal", facecolor="0.9")
+        place.set(title=name, aspect="equal", facecolor="0.9", xlabel="column [px]", ylabel="row [px]")
         place.invert_yaxis()
         figure.colorbar(drawn, ax=place, label=unit)
     write_figure(path, figure, dpi=80)
