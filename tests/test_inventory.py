@@ -2,6 +2,9 @@
 
 import ast
 import importlib
+import os
+import subprocess
+import sys
 from collections import defaultdict
 from pathlib import Path
 
@@ -168,3 +171,14 @@ def test_signatures_of_the_core_are_short():
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and parameters(node) > MOST_PARAMETERS
     }
     assert not long
+
+
+@pytest.mark.parametrize(("given", "policy"), [(None, "PASSIVE"), ("ACTIVE", "ACTIVE")])
+def test_threads_do_not_spin_while_they_wait(given, policy):
+    """OpenMP reads it when PyTorch is loaded, which must not be before; what is set already stays."""
+    told = "import os, sys; sys.modules['torch'] = None\ntry:\n    import torchfovea\nexcept ImportError:\n    "
+    told += "print(os.environ['OMP_WAIT_POLICY'])"
+    others = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    environment = others if given is None else {**others, "OMP_WAIT_POLICY": given}
+    done = subprocess.run([sys.executable, "-c", told], capture_output=True, text=True, env=environment, timeout=60)
+    assert done.stdout.strip() == policy, done.stderr

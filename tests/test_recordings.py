@@ -217,7 +217,7 @@ def test_a_recorded_search_played_again_is_the_search(tmp_path, matcher):
 
     recording = Folder(tmp_path)
     again = observer_of(Observer(head=recording.calibration.head, retina=observer.retina), recording.calibration)
-    robot = Playback(recording, again, Matcher(matcher), sample=500)
+    robot = Playback(recording, again, Matcher(matcher), sample=500, ahead=2)
     second = list(search(robot, again, memory, len(recording), torch.Generator().manual_seed(3)))
     assert len(second) == LOOKS
     for one, other in zip(first, second, strict=True):

@@ -4,6 +4,11 @@ The names below are the library; each is documented in the module it comes from.
 MuJoCo nor Hydra nor matplotlib nor OpenCV.
 """
 
+import os
+
+# read when torch is loaded: threads that wait for each other by spinning took five times the CPU beside other work
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 from torchfovea.deciding.acquisition import (
     choose,
     expected_improvement,

@@ -35,12 +35,14 @@ from torchfovea.recordings.playback import Playback, observer_of
 from torchfovea.search import Glance, search
 from torchfovea.sensing.head import eyes
 from torchfovea.setting import SettingError, require
+from torchfovea.stereo.external import External
+from torchfovea.stereo.matchers import Matcher
 
 __all__ = ["FIXATION_COLUMNS", "Replayed", "run"]
 
 FIXATION_COLUMNS = (
     "frame", "time_s", "pan_rad", "tilt_rad", "vergence_rad", "looked", "cells_seen", "next_pan_rad", "next_tilt_rad",
-    "next_vergence_rad", "x_m", "y_m", "z_m", "cpu_seconds",
+    "next_vergence_rad", "x_m", "y_m", "z_m", "cpu_seconds", "seconds",
 )  # fmt: skip
 
 
@@ -82,7 +84,9 @@ def run(cfg: DictConfig) -> float | None:
         passed.append(str(error))
         Console(stderr=True).print(f"replay: passed over: {error}", highlight=False, markup=False, soft_wrap=True)
 
-    robot = Playback(recording, observer, matcher, sample_of(cfg), pass_over if cfg.skip else None)
+    ours = isinstance(matcher, Matcher) and not isinstance(matcher.params, External)
+    ahead = whole(cfg, "ahead", 0) * ours
+    robot = Playback(recording, observer, matcher, sample_of(cfg), pass_over if cfg.skip else None, ahead)
     glances = search(robot, observer, memory, len(recording), generator, strategy)
     with viewers(cfg, folder, observer, "replay") as show:
         done = _play(robot, observer, memory, glances, len(recording), show if watched else None)
@@ -96,7 +100,7 @@ def run(cfg: DictConfig) -> float | None:
         from torchfovea.commands.replay.pictures import draw_replay
 
         draw_replay(folder / "replay.png", done.look, done.glance, done.colours, done.rows, observer.retina)
-    figures = figures_of(done, len(passed))
+    figures = figures_of(done, len(passed), ahead)
     write_result(folder, figures)
     grid = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     for name, value in figures.items():
@@ -155,16 +159,16 @@ def _play(robot: Playback, observer: Observer, memory: Memory, glances: Any, cou
     colours = unpainted(memory)
     with progress_bar() as progress:
         task = progress.add_task("replay", total=count)
-        start = time.process_time()
+        start, since = time.process_time(), time.perf_counter()
         try:
             for glance in glances:
                 colours = _colours(robot, observer, memory, colours, glance)
                 memory, last, look = glance.step.memory, glance, look if glance.look is None else glance
-                rows.append(_row(robot, glance, len(rows), time.process_time() - start))
+                rows.append(_row(robot, glance, len(rows), time.process_time() - start, time.perf_counter() - since))
                 if show is not None:
                     show(len(rows) - 1, glance)
                 progress.update(task, advance=1)
-                start = time.process_time()
+                start, since = time.process_time(), time.perf_counter()
         except (SettingError, KeyboardInterrupt) as error:
             if last is None:
                 raise
@@ -186,27 +190,29 @@ def _colours(robot: Playback, observer: Observer, before: Memory, colours: Tenso
     return painted(colours, looked, glance.step.points.mean, image, camera, pose)
 
 
-def _row(robot: Playback, glance: Glance, number: int, seconds: float) -> tuple[Any, ...]:
+def _row(robot: Playback, glance: Glance, number: int, *seconds: float) -> tuple[Any, ...]:
     assert robot.moment is not None
     step, cell = glance.step, int(glance.step.cell)
     point = step.points.mean[cell].tolist() if cell >= 0 else [None] * 3
     angles = [*map(float, glance.move.gaze)], [*map(float, step.gaze)]
     looked = int(glance.look is not None)
     seen = int((step.memory.looks > 0).sum())
-    return (number, robot.moment.time_s, *angles[0], looked, seen, *angles[1], *point, seconds)
+    return (number, robot.moment.time_s, *angles[0], looked, seen, *angles[1], *point, *seconds)
 
 
-def figures_of(done: Replayed, passed: int) -> dict[str, Any]:
+def figures_of(done: Replayed, passed: int, ahead: int) -> dict[str, Any]:
     """What a replay comes to."""
-    step, seconds = done.glance.step, [row[-1] for row in done.rows]
-    later = seconds[1:] or seconds  # the first frame warms up
+    # the first frame warms up, and in the last ones nothing is left to be matched ahead
+    step, later = done.glance.step, done.rows[1 : len(done.rows) - ahead] or done.rows
+    cpu, seconds = (sum(row[FIXATION_COLUMNS.index(name)] for row in later) for name in ("cpu_seconds", "seconds"))
     return {
         "frames": len(done.rows),
         "frames_with_images": sum(row[FIXATION_COLUMNS.index("looked")] for row in done.rows),
         "frames_passed_over": passed,
         "cells_seen": int((step.memory.looks > 0).sum()),
         "information": float(global_information(step.points.cov)),
-        "cpu_seconds_per_frame": sum(later) / len(later),
-        "frames_per_cpu_second": len(later) / max(sum(later), 1e-9),
+        "cpu_seconds_per_frame": cpu / len(later),
+        "frames_per_cpu_second": len(later) / max(cpu, 1e-9),
+        "frames_per_second": len(later) / max(seconds, 1e-9),
         "stopped": None if done.stopped is None else str(done.stopped) or "interrupted",
     }
