@@ -1,6 +1,7 @@
 """MkDocs hooks: the first page and the changes from the repository's own files, the reference from docstrings."""
 
 import ast
+import json
 import re
 from pathlib import Path
 
@@ -22,26 +23,36 @@ def on_config(config: MkDocsConfig) -> None:
         if "Reference" in section:
             section["Reference"] = [OVERVIEW, *(f"reference/{name}.md" for name in rooms())]
         if "Examples" in section:
-            section["Examples"] = [f"examples/{path.stem}.md" for path in sorted((ROOT / "examples").glob("*.py"))]
+            section["Examples"] = [f"examples/{path.stem}.md" for path in examples()]
 
 
 def on_files(files: Files, config: MkDocsConfig) -> None:
     """Make the pages that are not written but follow."""
     made = {"index.md": of_the_site("README.md"), "changes.md": of_the_site("CHANGELOG.md"), OVERVIEW: front_door()}
     made |= {f"reference/{name}.md": page_of(name, modules) for name, modules in rooms().items()}
-    made |= {f"examples/{path.stem}.md": shown(path) for path in sorted((ROOT / "examples").glob("*.py"))}
+    made |= {f"examples/{path.stem}.md": shown(path) for path in examples()}
     for uri, text in made.items():
         files.append(File.generated(config, uri, content=text))
 
 
 def on_page_markdown(markdown: str, **_: object) -> str:
     """Lead to the site's own page of an example."""
-    return re.sub(r"\]\((?:\.\./)+examples/(\w+)\.py\)", r"](examples/\1.md)", markdown)
+    return re.sub(r"\]\((?:\.\./)*examples/(\w+)\.(?:py|ipynb)\)", r"](examples/\1.md)", markdown)
+
+
+def examples() -> list[Path]:
+    """The example files, scripts and notebooks."""
+    return sorted(path for path in (ROOT / "examples").iterdir() if path.suffix in (".py", ".ipynb"))
 
 
 def shown(path: Path) -> str:
     """An example as a page."""
-    return f"# {path.name}\n\n`examples/{path.name}`\n\n```python\n{path.read_text(encoding='utf-8').rstrip()}\n```\n"
+    text = path.read_text(encoding="utf-8")
+    cells = json.loads(text)["cells"] if path.suffix == ".ipynb" else [{"cell_type": "code", "source": text}]
+    parts = ((cell["cell_type"], "".join(cell["source"]).rstrip()) for cell in cells)
+    # a notebook's own headline is one too many
+    shown = (f"```python\n{part}\n```" if kind == "code" else re.sub(r"^# ", "## ", part) for kind, part in parts)
+    return "\n\n".join([f"# {path.name}", f"`examples/{path.name}`", *shown]) + "\n"
 
 
 def of_the_site(name: str) -> str:
