@@ -23,8 +23,8 @@ from torchfovea.tuning.scenes import Scenes, nearest_point, stream
 from torchfovea.tuning.simulator import Run
 
 __all__ = [
-    "ALPHAS", "RIVALS", "Noted", "best_alpha", "fit_vector", "fitted", "fitted_bias", "nearest_share", "note_best",
-    "remembered", "remembered_bias", "with_alpha",
+    "ALPHAS", "RIVALS", "Noted", "best_alpha", "fit_mixture", "fit_vector", "fitted", "fitted_bias", "nearest_share",
+    "note_best", "remembered", "remembered_bias", "with_alpha",
 ]  # fmt: skip
 
 ALPHAS = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 2.5)
@@ -72,11 +72,9 @@ def fit_vector(shape: Shape, direction: Tensor, task: Tensor, alpha: float) -> T
             regression's six coefficients.
     """
     direction, task = direction.double(), task.double()
-    different = len((direction / _APART).round().unique(dim=0))
-    needed = max(shape.components + 1, 7 if shape.conditioned else 2)
-    require(different >= needed, "directions to fit", different, f"at least {needed} different ones for this bias")
     if not shape.conditioned:
-        return encode(shape, _mixture(direction, shape.components), alpha)
+        return encode(shape, fit_mixture(direction, shape.components), alpha)
+    _require_different(direction, max(shape.components + 1, 7))
     x, m = features(task), shape.components
     require(int(torch.linalg.matrix_rank(x)) == 6, "tasks to fit", len(x), "tasks that tell a quadratic function apart")
     coefficients = torch.linalg.lstsq(x, direction).solution
@@ -84,6 +82,25 @@ def fit_vector(shape: Shape, direction: Tensor, task: Tensor, alpha: float) -> T
     body[0] = numbers_of(_mixture(direction - x @ coefficients, m))
     body[:, : 3 * m] += coefficients.repeat(1, m)
     return torch.cat([body.flatten(), shape.tail(alpha, shape.fov_deg)])
+
+
+def fit_mixture(direction: Tensor, components: int = 1) -> DirectionMixture:
+    """The mixture that fits directions, see `fit_vector`.
+
+    Args:
+        direction: unit (K, 3).
+        components: M ≥ 1.
+
+    Raises:
+        SettingError: for a degenerate fit: fewer different directions than components and one more.
+    """
+    _require_different(direction, components + 1)
+    return _mixture(direction.double(), components)
+
+
+def _require_different(direction: Tensor, needed: int) -> None:
+    different = len((direction / _APART).round().unique(dim=0))
+    require(different >= needed, "directions to fit", different, f"at least {needed} different ones for this bias")
 
 
 def _mixture(v: Tensor, components: int) -> DirectionMixture:

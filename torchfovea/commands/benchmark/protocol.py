@@ -20,10 +20,14 @@ TRACKS = ("policy", "matcher", "memory", "whole")
 FAMILIES: dict[str, tuple[str, ...]] = {
     "open": ("scene=cans", "scene.outside_first_view=true", "sensor.fov_deg=90"),
     "narrow": ("family=narrow",),
-    "small": ("family=small",),
+    # the targets anywhere, as the family had them when the protocol was frozen
+    "small": (
+        "family=small", "scene.target_azimuth_deg=[-65.0,65.0]", "scene.target_elevation_deg=[-40.0,40.0]",
+        "scene.outside_first_view=true",
+    ),
     "far": ("family=far",),
     "twins": ("family=twins",),
-}
+}  # fmt: skip
 
 # first seed and number of scenes in each family; training is anybody's, validation chooses, test is reported
 SPLITS = {"training": (10_000, 1024), "validation": (20_000, 64), "test": (30_000, 64)}

@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
 
+from torchfovea.commands.search.remembering import Best, best_of, biased, check_resample, refit, rounds, write_bias
 from torchfovea.commands.shared.build import (
     build_match,
     build_motor,
@@ -66,7 +67,7 @@ def run(cfg: DictConfig) -> float:
     require(alone, "workers", cfg.workers, "1 with viewer or video, which follow the last episode")
     # mistakes come first, also in what is not used
     build_strategy(cfg, observer), build_match(cfg), build_motor(cfg), build_route(cfg), build_noise(cfg)
-    loaded_memory(cfg, observer)
+    loaded_memory(cfg, observer), check_resample(cfg, observer)
     saved = memory_path(cfg, "memory.save")
     done = finished(cfg, folder)
     if done is not None:
@@ -82,9 +83,8 @@ def run(cfg: DictConfig) -> float:
 
         seeds, recordings = [seed + k for k in range(episodes)], _recordings(cfg, folder, episodes)
         with viewers(cfg, folder, observer, "episode") as show:
-            for k, figures, course, episode in _episodes(
-                cfg, observer, seeds, advance, recordings, show if watched else None
-            ):
+            shown = show if watched else None
+            for k, figures, course, _, episode in _learning(cfg, observer, seeds, advance, recordings, shown, folder):
                 last = episode
                 rows.append((k, seed + k, *figures))
                 steps.extend((k, *line) for line in course)
@@ -101,7 +101,7 @@ def run(cfg: DictConfig) -> float:
     return float(summary["gap_per_saccade"])
 
 
-Outcome = tuple[int, tuple[Any, ...], list[tuple[Any, ...]], Episode | None]
+Outcome = tuple[int, tuple[Any, ...], list[tuple[Any, ...]], Best, Episode | None]
 
 
 def _recordings(cfg: DictConfig, folder: Path, episodes: int) -> list[str | None]:
@@ -113,39 +113,67 @@ def _recordings(cfg: DictConfig, folder: Path, episodes: int) -> list[str | None
     return [str(whole_run)] if episodes == 1 else [str(whole_run / str(k)) for k in range(episodes)]
 
 
-def _episodes(
+def _learning(
     cfg: DictConfig,
     observer: Observer,
     seeds: list[int],
     advance: Callable[[int], None],
     recordings: list[str | None],
     show: Show | None,
+    folder: Path,
 ) -> Iterator[Outcome]:
-    """Number, figures and course of every episode in order; the last one's episode itself besides."""
+    """The episodes; with memory.resample in rounds, after each of which the bias is fitted to what it has found."""
+    if not check_resample(cfg, observer):
+        yield from _episodes(cfg, observer, seeds, range(len(seeds)), advance, recordings, show)
+        return
+    for part in rounds(len(seeds)):
+        found = []
+        for outcome in _episodes(cfg, observer, seeds, part, advance, recordings, show):
+            found.append(outcome[3])
+            yield outcome
+        mixture = refit(cfg, found)
+        if mixture is not None:
+            cfg = biased(cfg, mixture)
+            write_bias(folder, mixture)
+
+
+def _episodes(
+    cfg: DictConfig,
+    observer: Observer,
+    seeds: list[int],
+    numbers: range,
+    advance: Callable[[int], None],
+    recordings: list[str | None],
+    show: Show | None,
+) -> Iterator[Outcome]:
+    """Number, figures, course and best fixation of some episodes in order; of all the last one's episode itself."""
     (workers, backend), final = workers_of(cfg), len(seeds) - 1
     if batched(cfg):
         size = whole(cfg, "batch")
-        for start in range(0, len(seeds), size):
-            part = seeds[start : start + size]
+        for start in numbers[::size]:
+            part = seeds[start : min(start + size, numbers.stop)]
             last = show if start + len(part) > final else None
             together = roll_out(cfg, observer, part, each=_each(advance, len(part), last))
-            for k, episode in enumerate(together, start):
-                yield k, episode_row(episode), saccade_rows(episode), episode if k == final else None
+            yield from (_outcome(k, episode, k == final) for k, episode in enumerate(together, start))
         return
     if workers == 1 or final == 0:
-        for k, seed in enumerate(seeds):
-            episode = one_episode(cfg, observer, seed, _each(advance, 1, show if k == final else None), recordings[k])
-            yield k, episode_row(episode), saccade_rows(episode), episode if k == final else None
+        for k in numbers:
+            each = _each(advance, 1, show if k == final else None)
+            yield _outcome(k, one_episode(cfg, observer, seeds[k], each, recordings[k]), k == final)
         return
     settings = OmegaConf.to_yaml(OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"]), resolve=True)
     outcomes: dict[int, Outcome] = {}
-    work = [(settings, k, seed, k == final, recordings[k]) for k, seed in enumerate(seeds)]
-    for k, outcome in spread(_elsewhere, work, workers, backend):
+    work = [(settings, k, seeds[k], k == final, recordings[k]) for k in numbers]
+    for _, outcome in spread(_elsewhere, work, workers, backend):
         if isinstance(outcome, Exception):
             raise outcome
         advance(whole(cfg, "saccades"))
-        outcomes[k] = outcome
-    yield from (outcomes[k] for k in range(len(seeds)))
+        outcomes[outcome[0]] = outcome
+    yield from (outcomes[k] for k in numbers)
+
+
+def _outcome(k: int, episode: Episode, kept: bool) -> Outcome:
+    return k, episode_row(episode), saccade_rows(episode), best_of(episode), episode if kept else None
 
 
 def _each(advance: Callable[[int], None], count: int, show: Show | None = None) -> Each:
@@ -165,8 +193,7 @@ def _elsewhere(work: tuple[str, int, int, bool, str | None]) -> Outcome:
     settings, k, seed, kept, record = work
     cfg = OmegaConf.create(settings)
     assert isinstance(cfg, DictConfig)
-    episode = one_episode(cfg, build_observer(cfg), seed, record=record)
-    return k, episode_row(episode), saccade_rows(episode), episode if kept else None
+    return _outcome(k, one_episode(cfg, build_observer(cfg), seed, record=record), kept)
 
 
 def saccade_rows(episode: Episode) -> list[tuple[Any, ...]]:

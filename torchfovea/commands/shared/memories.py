@@ -1,15 +1,18 @@
-"""Memories that a run goes on from, and those that it leaves: the settings memory.load and memory.save."""
+"""Memories that a run goes on from and leaves (the settings memory.load and memory.save), and biases as files."""
 
 from __future__ import annotations
+
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
 from torchfovea.memory.egosphere import Memory
+from torchfovea.memory.sphere import DirectionMixture
 from torchfovea.memory.store import check_memory_path, load_memory
 from torchfovea.perception import Observer, check_owner
 from torchfovea.setting import require
 
-__all__ = ["loaded_memory", "memory_path"]
+__all__ = ["loaded_memory", "memory_path", "mixture_settings", "mixture_yaml"]
 
 
 def memory_path(cfg: DictConfig, setting: str) -> str | None:
@@ -34,3 +37,19 @@ def loaded_memory(cfg: DictConfig, observer: Observer) -> Memory | None:
     require(memory.cells.dim() == 2, "memory.load", path, f"one memory, and no batch of {len(memory.cells)}")
     check_owner(observer, memory)
     return memory
+
+
+def mixture_settings(mixture: DirectionMixture) -> dict[str, Any]:
+    """A bias as the group `memory` has it: weights, means and covariances."""
+    covariance = mixture.cholesky @ mixture.cholesky.mT
+    return {
+        "weights": [round(v, 6) for v in mixture.logits.softmax(-1).tolist()],
+        "means": [[round(v, 6) for v in row] for row in mixture.means.tolist()],
+        "covariances": [[[round(v, 8) for v in row] for row in matrix] for matrix in covariance.tolist()],
+    }
+
+
+def mixture_yaml(mixture: DirectionMixture, note: str, name: str) -> str:
+    """A bias in the form of conf/memory/*.yaml, with a comment on its first line."""
+    content = {"name": name, "cells": 20000, **mixture_settings(mixture)}
+    return f"# {note}\n" + OmegaConf.to_yaml(OmegaConf.create(content))

@@ -9,6 +9,7 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
+from torchfovea.commands.shared.memories import mixture_yaml
 from torchfovea.files import replacing
 from torchfovea.tuning.bias import decode, mixture_of
 from torchfovea.tuning.problem import Problem
@@ -21,16 +22,7 @@ _CORNERS = [(float(a), float(e)) for a in (-1, 0, 1) for e in (-1, 0, 1)]
 
 def memory_yaml(problem: Problem, vector: Tensor, task: Tensor | None, note: str, name: str = "tuned") -> str:
     """A bias in the form of conf/memory/*.yaml."""
-    mixture = mixture_of(problem.shape, vector.double(), task)
-    covariance = mixture.cholesky @ mixture.cholesky.mT
-    content = {
-        "name": name,
-        "cells": 20000,
-        "weights": [round(v, 6) for v in mixture.logits.softmax(-1).tolist()],
-        "means": [[round(v, 6) for v in row] for row in mixture.means.tolist()],
-        "covariances": [[[round(v, 8) for v in row] for row in matrix] for matrix in covariance.tolist()],
-    }
-    return f"# {note}\n" + OmegaConf.to_yaml(OmegaConf.create(content))
+    return mixture_yaml(mixture_of(problem.shape, vector.double(), task), note, name)
 
 
 def write_memory(problem: Problem, vector: Tensor, folder: Path, name: str = "tuned", how: str = "Tuned on") -> None:
