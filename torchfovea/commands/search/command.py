@@ -12,7 +12,15 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
 
-from torchfovea.commands.search.remembering import Best, best_of, biased, check_resample, refit, rounds, write_bias
+from torchfovea.commands.search.remembering import (
+    Best,
+    best_fixation,
+    biased,
+    check_resample,
+    refit,
+    rounds,
+    write_bias,
+)
 from torchfovea.commands.shared.build import (
     build_match,
     build_motor,
@@ -173,7 +181,7 @@ def _episodes(
 
 
 def _outcome(k: int, episode: Episode, kept: bool) -> Outcome:
-    return k, episode_row(episode), saccade_rows(episode), best_of(episode), episode if kept else None
+    return k, episode_row(episode), saccade_rows(episode), best_fixation(episode), episode if kept else None
 
 
 def _each(advance: Callable[[int], None], count: int, show: Show | None = None) -> Each:

@@ -19,7 +19,7 @@ from torchfovea.perception import Observer
 from torchfovea.setting import SettingError, require
 from torchfovea.tuning.rivals import Noted, fit_mixture, nearest_share
 
-__all__ = ["Best", "best_of", "biased", "check_resample", "refit", "rounds", "write_bias"]
+__all__ = ["Best", "best_fixation", "biased", "check_resample", "refit", "rounds", "write_bias"]
 
 NAME = "remembered"
 FIRST = 16  # episodes before the first refit
@@ -62,7 +62,7 @@ def rounds(episodes: int) -> list[range]:
     return found
 
 
-def best_of(episode: Episode) -> Best:
+def best_fixation(episode: Episode) -> Best:
     """Where the best fixation of an episode landed, as a gaze that has come to rest there measures it."""
     t = int(episode.reward.argmax())
     return Best(episode.direction[t], -float(episode.reward[t]))
