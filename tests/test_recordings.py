@@ -200,8 +200,10 @@ def test_what_is_no_recording_is_refused(tmp_path):
     other = Calibration(CAMERA, replace(CAMERA, cx_px=60.0), (SIDE, SIDE))
     write_calibration(path, other)
     assert read_calibration(path) == other
-    with pytest.raises(SettingError, match=r"calibration.right"):
-        observer_of(Observer(), other)
+    # each retina lies about its own axis
+    assert observer_of(Observer(), other).camera_right is None
+    two = observer_of(Observer(), other._replace(right=replace(CAMERA, focal_px=110.0)))
+    assert two.cameras == (two.camera, two.camera_right) and two.camera_right.focal_px > two.camera.focal_px
 
 
 @pytest.mark.parametrize("matcher", [SGBM(), Sweep(hypotheses=64)], ids=["sgbm", "sweep"])

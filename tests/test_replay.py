@@ -5,11 +5,19 @@ import json
 import re
 import shutil
 
+import cv2
 import numpy as np
 import pytest
+import torch
 
 from torchfovea.cli import main
 from torchfovea.memory.store import load_memory
+from torchfovea.recordings.folder import Recorder
+from torchfovea.recordings.frames import Calibration
+from torchfovea.sensing.head import Gaze, Head, eyes, fixate
+from torchfovea.sensing.lens import BrownConrady
+from torchfovea.sim.rays import cast, render
+from torchfovea.sim.scene import AttentionWorld, build_scene
 
 COMMON = ["sensor.receptive_fields=500", "memory.cells=400", "seed=2", "budget=ours"]
 
@@ -119,3 +127,52 @@ def test_a_recording_without_a_head_asks_for_it(recording, tmp_path, capsys):
 def test_only_images_are_recorded(tmp_path, capsys):
     assert main(["search", "record=true", "fidelity=geometric", f"hydra.run.dir={tmp_path / 'run'}"]) == 1
     assert "record = True: expected images, fidelity=photometric" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def unequal(tmp_path_factory):
+    """A recording by two lenses that differ, whose calibration is OpenCV's file alone."""
+    folder, head = tmp_path_factory.mktemp("unequal"), Head()
+    left = BrownConrady(100.0, 100.0, 80.0, 78.0, (-0.1, 0.02, 0, 0, 0))
+    right = BrownConrady(112.0, 110.0, 77.0, 83.0, (-0.16, 0.03, 0.001, 0, 0))
+    room = build_scene(AttentionWorld(), 0, head)
+    writer = Recorder(folder / "recording", Calibration(left, right, (160, 160)))
+    points = torch.tensor([[1.5, 0.3, -0.3], [1.5, 0.1, -0.2]], dtype=torch.float64)
+    for k, gaze in enumerate(zip(*fixate(head, points)[0], strict=True)):
+        pose = eyes(head, Gaze(*gaze))
+        turned = ((pose.R_left, pose.t_left, left), (pose.R_right, pose.t_right, right))
+        writer.write(k, *(render(room, R, t, camera, 160).image for R, t, camera in turned), Gaze(*gaze))
+    (folder / "recording" / "calibration.json").unlink()
+    file = cv2.FileStorage(str(folder / "stereo.yml"), cv2.FILE_STORAGE_WRITE)
+    for name, lens in (("1", left), ("2", right)):
+        matrix = np.array([[lens.fx_px, 0, lens.cx_px], [0, lens.fy_px, lens.cy_px], [0, 0, 1]])
+        file.write(f"M{name}", matrix)
+        file.write(f"D{name}", np.array(lens.distortion))
+    file.write("R", np.eye(3))
+    file.write("T", np.array([-head.baseline_m, 0, 0]))
+    file.release()
+    return folder, room
+
+
+@pytest.mark.parametrize("matcher", ["sgbm", "sweep"])
+def test_eyes_that_differ_by_a_calibrations_file(unequal, tmp_path, matcher):
+    """The memory's points are where the room's surfaces are."""
+    folder, room = unequal
+    more = ["sensor.receptive_fields=3000", "memory.cells=3000", "head=vizzy", f"matcher={matcher}", "picture=false"]
+    assert replay(tmp_path, folder / "recording", *more, f"calibration={folder / 'stereo.yml'}") == 0
+    with np.load(tmp_path / "points.npz") as cloud:
+        points, cov = (torch.from_numpy(cloud[name]).double() for name in ("mean_m", "cov_m2"))
+    range_m = points.norm(dim=-1)
+    ray = points / range_m[:, None]
+    off = range_m - cast(room, torch.zeros(3, dtype=torch.float64), ray).range_m
+    x, y, z = ray.unbind(-1)  # the covariance's order: xx xy xz yy yz zz
+    sigma = (cov * torch.stack([x * x, 2 * x * y, 2 * x * z, y * y, 2 * y * z, z * z], -1)).sum(-1).sqrt()
+    assert len(points) > 1000 and (off / range_m).abs().median() < 0.08 and (off / sigma).abs().median() < 0.8
+
+
+def test_a_folder_without_a_calibration_says_so(unequal, tmp_path, capsys):
+    folder = unequal[0] / "recording"
+    assert replay(tmp_path, folder, "head=vizzy") == 1
+    assert "calibration.json: expected a recording's calibration.json" in capsys.readouterr().err
+    assert replay(tmp_path, folder, "head=vizzy", "calibration_lens=brown_conrady") == 1
+    assert "calibration_lens = brown_conrady: expected no such setting" in capsys.readouterr().err

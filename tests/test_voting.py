@@ -272,17 +272,18 @@ def test_what_a_look_should_have_shown_lies_on_both_retinas():
     drawn = torch.rand(2, 400, generator=generator, dtype=torch.float64)
     vector = columns(0 * drawn, 0 * drawn, (3 * drawn - 0.5) * memory.information.matrix[..., 5])
     memory = memory._replace(information=type(memory.information)(vector, memory.information.matrix))
-    camera, retina = Pinhole.from_fov(60.0, 100.0), LogPolar(400)
+    cameras, retina = (Pinhole.from_fov(60.0, 100.0), Pinhole.from_fov(50.0, 100.0)), LogPolar(400)
     pose = eyes(Head(), Gaze(*torch.tensor([[0.4, -0.3], [0.1, 0.3], [0.2, 0.0]], dtype=torch.float64)))
     among = torch.rand(2, 400, generator=generator) < 0.7
-    got = within_sight(memory, among, pose, camera, retina)
+    got = within_sight(memory, among, pose, cameras, retina)
     points = cartesian_belief(memory).mean
     for b in range(2):
-        one = within_sight(empty_of(memory, b), among[b], Eyes(*(part[b] for part in pose)), camera, retina)
+        one = within_sight(empty_of(memory, b), among[b], Eyes(*(part[b] for part in pose)), cameras, retina)
         assert torch.equal(one, got[b]) and 5 < int(one.sum()) < 200
         for c in range(400):
             seen = bool(among[b, c])
-            for rotation, origin in ((pose.R_left, pose.t_left), (pose.R_right, pose.t_right)):
+            poses = ((pose.R_left, pose.t_left), (pose.R_right, pose.t_right))
+            for camera, (rotation, origin) in zip(cameras, poses, strict=True):
                 x, y, z = (rotation[b].T @ (points[b, c] - origin[b])).tolist()
                 seen = seen and z > 0 and camera.focal_px * math.hypot(x, y) <= retina.radius_px * z
             assert seen == bool(got[b, c])

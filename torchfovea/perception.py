@@ -54,7 +54,7 @@ class Observer:
 
     Attributes:
         head: kinematics and limits: a `Head`, or one of your own (`torchfovea.sensing.head.Kinematics`).
-        camera: both eyes' camera, in retinal pixels.
+        camera: both eyes' camera, or the left one's, in retinal pixels.
         retina: both eyes' retina.
         budget: where a correspondence's standard deviation comes from.
         points: sigma points of the unscented transform; None: those that suit the chart.
@@ -66,6 +66,7 @@ class Observer:
         eligibility: which cells may be fixated.
         classes: what classes of things there are, and which one is sought: a cell's reward is then that of its surface
             times its share of the class. None: whatever is near is good.
+        camera_right: the right eye's camera, if it is another; simulated eyes are alike.
         compile: whether what is hot runs as compiled kernels, see `compiled`: off, auto or on.
 
     How it chooses among them is no part of it: `decide` and `torchfovea.search.search` take a `strategy`.
@@ -82,8 +83,14 @@ class Observer:
     reward: str | Callable[[Tensor], Tensor] = "inverse_range"
     eligibility: Eligibility = field(default_factory=Eligibility)
     classes: Classes | None = None
+    camera_right: Camera | None = None
     compile: str = "off"
     acquisition: InitVar[None] = None  # where strategies once were
+
+    @property
+    def cameras(self) -> tuple[Camera, Camera]:
+        """The left eye's and the right eye's."""
+        return self.camera, self.camera if self.camera_right is None else self.camera_right
 
     def __post_init__(self, acquisition: None) -> None:
         """Raise SettingError for an unknown reward, and for a strategy."""
@@ -180,7 +187,7 @@ def perceive(
     """
     check_owner(observer, memory)
     support = observer.retina.width_px(matches.left_px) / 2 if matches.support_px is None else matches.support_px
-    seen = matches, eyes, observer.camera, support, observer.points, observer.fusion.chart, observer.rotated
+    seen = matches, eyes, observer.cameras, support, observer.points, observer.fusion.chart, observer.rotated
     with compiling(observer.compile):
         observed = observe(*seen)
     sigma = math.radians(observer.head.encoder_deg)
@@ -195,7 +202,7 @@ def perceive(
     with compiling(observer.compile):
         after = remember(memory, observed, observer.fusion, common, kin, matches.classes)
     if observer.fusion.votes:
-        missed = within_sight(memory, after.looks == memory.looks, eyes, observer.camera, observer.retina)
+        missed = within_sight(memory, after.looks == memory.looks, eyes, observer.cameras, observer.retina)
         after = after._replace(votes=against(after.votes, missed))
     return after._replace(axis=axis)
 

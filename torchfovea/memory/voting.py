@@ -157,14 +157,14 @@ def against(votes: Tensor, missed: Tensor) -> Tensor:
     return columns(yes, no + missed.to(no))
 
 
-def within_sight(memory: Memory, among: Tensor, eyes: Eyes, camera: Camera, retina: Retina) -> Tensor:
+def within_sight(memory: Memory, among: Tensor, eyes: Eyes, cameras: tuple[Camera, Camera], retina: Retina) -> Tensor:
     """Which of some cells have points that fall on both retinas.
 
     Args:
         memory: of patches.
         among: the cells that are asked, bool (..., Nx).
         eyes: their poses (...).
-        camera: of both.
+        cameras: the left one's and the right one's.
         retina: of both.
 
     Returns:
@@ -175,7 +175,8 @@ def within_sight(memory: Memory, among: Tensor, eyes: Eyes, camera: Camera, reti
         vector, matrix, cells = (gather_columns(part, which) for part in (*memory.information, memory.cells))
         rho = nearness(Information(vector, matrix))[0].clamp(min=1 / FAR_M)[:, None]
         inside = torch.ones_like(rho, dtype=torch.bool)
-        for rotation, origin in ((eyes.R_left, eyes.t_left), (eyes.R_right, eyes.t_right)):
+        poses = ((eyes.R_left, eyes.t_left), (eyes.R_right, eyes.t_right))
+        for camera, (rotation, origin) in zip(cameras, poses, strict=True):
             rotation, origin = rotation.expand(*lead, 3, 3).reshape(-1, 3, 3), origin.expand(*lead, 3).reshape(-1, 3)
             if len(rotation) > 1:
                 row = which // among.shape[-1]

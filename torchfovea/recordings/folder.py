@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import torch
@@ -22,6 +22,7 @@ from torchfovea.recordings.frames import (
 )
 from torchfovea.recordings.pictures import read_picture, write_picture
 from torchfovea.recordings.poses import Pose, ahead, matrix_from_quaternion, quaternion_from_matrix, step_between, still
+from torchfovea.sensing.camera import Camera
 from torchfovea.sensing.head import Gaze
 from torchfovea.setting import SettingError, require
 
@@ -36,6 +37,9 @@ _COVARIANCE = tuple(f"cov_{_AXES[i]}_{_AXES[j]}" for i, j in _PAIRS)
 
 COLUMNS = (*_IMAGES, *_JOINTS, *_PLACE, *_TURN, *_COVARIANCE)
 """Of frames.csv, as `Recorder` writes it; `Folder` does without all but time_s, left and right."""
+
+
+Cameras = Callable[[tuple[int, int]], tuple[Camera, Camera]]
 
 
 class Recorder:
@@ -100,16 +104,17 @@ class Folder:
 
     Args:
         folder: as `Recorder` writes it, or made by hand.
+        cameras: tells both cameras for images of a width and height, in place of calibration.json's, which may be
+            missing then.
 
     Raises:
         SettingError: for a folder without frames.csv or calibration.json, or a table without its columns.
     """
 
-    def __init__(self, folder: str | os.PathLike[str]) -> None:
+    def __init__(self, folder: str | os.PathLike[str], cameras: Cameras | None = None) -> None:
         self.folder = Path(folder)
         self._table = self.folder / "frames.csv"
         require(self._table.is_file(), "recording", self.folder, "a folder with frames.csv, or a bag")
-        self.calibration = read_calibration(self.folder / "calibration.json")
         try:
             with self._table.open(newline="", encoding="utf-8") as file:
                 reader = csv.DictReader(file)
@@ -124,6 +129,23 @@ class Folder:
         turn = set(_TURN) <= set(given) or "yaw_rad" in given
         self._moves = {"x_m", "y_m"} <= set(given) and turn
         require(bool(self._rows), "recording", self._table, "at least one frame")
+        told = self.folder / "calibration.json"
+        if cameras is None:
+            self.calibration = read_calibration(told)
+        elif told.is_file():
+            known = read_calibration(told)
+            left, right = cameras(known.size_px)
+            self.calibration = known._replace(left=left, right=right)
+        else:
+            size = self._size()
+            self.calibration = Calibration(*cameras(size), size, None, False)
+
+    def _size(self) -> tuple[int, int]:
+        """Width and height of the first image."""
+        names = [row[side] for row in self._rows for side in _IMAGES[1:] if row[side]]
+        require(bool(names), "recording", self._table, "at least one image")
+        height, width = read_picture(self.folder / names[0]).shape[-2:]
+        return width, height
 
     def __len__(self) -> int:
         """How many frames there are."""

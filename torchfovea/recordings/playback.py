@@ -24,14 +24,12 @@ __all__ = ["Playback", "observer_of", "views_of"]
 
 
 def observer_of(observer: Observer, calibration: Calibration) -> Observer:
-    """The observer with a recording's camera, in the pixels of its own retina.
-
-    Raises:
-        SettingError: for eyes that differ.
-    """
-    require(calibration.left == calibration.right, "calibration.right", calibration.right, "the left eye's camera")
-    eye, scale = calibration.left, 2 * observer.retina.radius_px / min(calibration.size_px)
-    return replace(observer, camera=eye.scaled(scale, (-scale * eye.cx_px, -scale * eye.cy_px)))
+    """The observer with a recording's cameras, in the pixels of its own retinas, each about its camera's axis."""
+    scale = 2 * observer.retina.radius_px / min(calibration.size_px)
+    left, right = (
+        eye.scaled(scale, (-scale * eye.cx_px, -scale * eye.cy_px)) for eye in (calibration.left, calibration.right)
+    )
+    return replace(observer, camera=left, camera_right=None if left == right else right)
 
 
 class _Coming(NamedTuple):
@@ -126,7 +124,8 @@ def views_of(moment: Moment, calibration: Calibration, head: Head | Kinematics, 
     assert moment.left is not None and moment.right is not None
     left, right = calibration.left, calibration.right
     rig = rig_at(head, gaze)
-    return posed_views(moment.left, moment.right, left, right, rig, (left.cx_px, left.cy_px))
+    axes = ((eye.cx_px, eye.cy_px) for eye in (left, right))
+    return posed_views(moment.left, moment.right, left, right, rig, *axes)
 
 
 def _raised(error: SettingError) -> None:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchfovea.cloud import carried_colours, cloud_of, painted, unpainted, write_cloud
 from torchfovea.commands.shared.build import build_cells, build_match, build_observer, name_of
+from torchfovea.commands.shared.cameras import OF_FILES, cameras_of_files
 from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.memories import loaded_memory, memory_path
 from torchfovea.commands.shared.progress import progress_bar
@@ -121,7 +122,11 @@ def open_recording(cfg: DictConfig) -> Recording:
     topics = construct(Topics, cfg.bag, "bag")
     if path.is_dir() and not (path / "metadata.yaml").exists():
         refuse_unread("bag.*")
-        return Folder(path)
+        if cfg.calibration is None:
+            refuse_unread("calibration_images", *OF_FILES)
+            return Folder(path)
+        return Folder(path, lambda size: cameras_of_files(cfg, size)[:2])
+    refuse_unread("calibration", "calibration_images", *OF_FILES)
     return Bag(path, topics)
 
 

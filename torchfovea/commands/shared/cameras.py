@@ -12,7 +12,7 @@ from torchfovea.stereo.calibration_files import KINDS, Options, StereoCalibratio
 from torchfovea.stereo.calibration_formats import LENSES
 from torchfovea.stereo.rig import StereoRig
 
-__all__ = ["cameras_of"]
+__all__ = ["OF_FILES", "cameras_of", "cameras_of_files"]
 
 BY_HAND = ("focal_px", "cx_px", "cy_px", "baseline_m")
 OF_FILES = ("calibration_right", "calibration_lens", "calibration_cameras", "calibration_unit_m")
@@ -32,6 +32,15 @@ def cameras_of(cfg: DictConfig, size_px: tuple[int, int]) -> StereoCalibration:
     for name in BY_HAND:
         require(cfg[name] is None, name, cfg[name], f"null: calibration = {cfg.calibration} tells it")
     require(cfg.doffs_px == 0, "doffs_px", cfg.doffs_px, f"0: calibration = {cfg.calibration} tells it")
+    return cameras_of_files(cfg, size_px)
+
+
+def cameras_of_files(cfg: DictConfig, size_px: tuple[int, int]) -> StereoCalibration:
+    """The cameras of the files that a configuration names, for images of a width and height.
+
+    Raises:
+        SettingError: for all that `load_calibration` refuses.
+    """
     names = [name for name in ("calibration", "calibration_right") if cfg[name] is not None]
     for name in names:
         require(isinstance(cfg[name], str), name, cfg[name], "a file's name")
