@@ -29,8 +29,8 @@ def check_memory_path(path: str | os.PathLike[str], setting: str = "path") -> No
         SettingError: for another suffix than .npz, or a folder that is not there.
     """
     folder = os.path.dirname(os.path.abspath(path))
-    good = str(path).endswith(".npz") and os.path.isdir(folder)
-    require(good, setting, path, "a name that ends in .npz, in a folder that exists")
+    good = str(path).endswith(".npz") and os.path.isdir(folder) and os.access(folder, os.W_OK)
+    require(good, setting, path, "a name that ends in .npz, in a folder that exists and can be written")
 
 
 def save_memory(path: str | os.PathLike[str], memory: Memory) -> None:

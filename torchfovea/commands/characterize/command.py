@@ -15,7 +15,7 @@ from rich.table import Table
 from torch import Tensor
 
 from torchfovea.commands.characterize.honesty import CHUNK, plan_cases, plan_planes, propagate, realise, wholes
-from torchfovea.commands.shared.build import build_camera, construct, number, whole
+from torchfovea.commands.shared.build import build_camera, build_matcher, construct, number, whole
 from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.manifest import complete, finished
 from torchfovea.commands.shared.progress import progress_bar
@@ -51,6 +51,9 @@ def run(cfg: DictConfig) -> float:
     """Characterize both sensors; the smallest advantage of the foveal one is what a sweeper sees."""
     refuse_unread("budget.source", "budget.sigma_points")
     cfg = _sized(cfg)
+    for name in ("propagation.run", "realised.run"):
+        asked = OmegaConf.select(cfg, name)
+        require(isinstance(asked, bool), name, asked, "true or false")
     printed = _sensors(cfg)
     full = {name: _with(sensor, _budget(cfg, whole(cfg, "sensor.source_px", 16))) for name, sensor in printed.items()}
     distance, vergence = _axis(cfg, "distance", "_m"), torch.deg2rad(_axis(cfg, "vergence", "_deg"))
@@ -59,6 +62,7 @@ def run(cfg: DictConfig) -> float:
     planned = plan_cases(cfg, full["log_polar"]) if cfg.propagation.run else None
     generator = torch.Generator().manual_seed(whole(cfg, "seed", 0))
     layouts = _small_layouts(cfg)
+    build_matcher(cfg), whole(cfg, "realised.planes")  # mistakes come first, also in what is not used
     folder = run_folder()
     done_before = finished(cfg, folder, "foveal_advantage_min_nats")
     if done_before is not None:

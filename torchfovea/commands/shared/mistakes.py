@@ -176,6 +176,8 @@ def _composition(error: HydraException, overrides: Sequence[str], known: Iterabl
         return _configuration(cause, overrides) or _first_line(error)
     if unknown := re.match(r"Could not override '([^'@]+)", str(error)):  # a group that the command does not have
         return f"{_given(unknown[1], overrides)}: expected a known setting{closest(unknown[1], known)}"
+    if merged := re.match(r"Error merging override [+~]*([^=@]+)", str(error)):  # a mapping for a list, and the like
+        return f"{_given(merged[1], overrides)}: expected a value of the kind that the setting has"
     return _first_line(error)
 
 

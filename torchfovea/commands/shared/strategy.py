@@ -164,9 +164,9 @@ def infomax(observer: Observer, overhead: float | None = None, unit: str = "degr
 
 def build_stop(cfg: DictConfig) -> StopRule | None:
     """When the best is known well enough: (tolerance, probability), or None for never."""
+    tolerance = read_number(cfg, "stop.tolerance", "a number of at least 0, in the units of the reward", 0.0)
     if OmegaConf.select(cfg, "stop.probability") is None:
         return None
-    tolerance = read_number(cfg, "stop.tolerance", "a number of at least 0, in the units of the reward", 0.0)
     probability = read_number(cfg, "stop.probability", "a probability between 0 and 1, or null", 0.0)
     require(0 < probability < 1, "stop.probability", probability, "a probability between 0 and 1, or null")
     return tolerance, probability

@@ -90,6 +90,7 @@ def _run(cfg: DictConfig) -> float:
     assert isinstance(settings, dict)
     merged = {str(name): value for name, value in settings.items()} | sizes
     schedule = construct(Schedule, merged, "tune")
+    heldout = Heldout(sizes["heldout_scenes"], whole(cfg, "heldout_seed", 0))
     start, folder = build_start(cfg, problem.shape), run_folder()
     checkpoint = folder / "checkpoint.pt"
     if cfg.resume is not None:
@@ -120,7 +121,6 @@ def _run(cfg: DictConfig) -> float:
         figures["fov_deg"] = fov_of(problem.shape, state.best)
     write_memory(problem, state.best, folder)
     write_scenes(problem.distribution, folder)
-    heldout = Heldout(sizes["heldout_scenes"], whole(cfg, "heldout_seed", 0))
     table, best = judge_policies(cfg, problem, start, state, schedule, heldout, figures, folder)
     rows: list[Row] = []
     checks: list[dict[str, Any]] = []

@@ -1,0 +1,33 @@
+"""A short part of what `scripts/long_run.py` does for long: float32 holds, memory and time do not grow."""
+
+import importlib.util
+import math
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="module")
+def script():
+    path = Path(__file__).resolve().parents[1] / "scripts" / "long_run.py"
+    spec = importlib.util.spec_from_file_location("long_run", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_thousands_of_float32_fusions_are_those_of_float64(script):
+    drift = script.fuse_often(5000, still=False)
+    assert drift.positive_definite
+    # rounding of a sum of n, beside a deviation that shrinks with its root: far below one deviation
+    assert drift.mean_sigmas < 0.2 and drift.covariance < 1e-3
+
+
+def test_an_episode_of_hundreds_of_saccades_grows_in_nothing_but_knowledge(script):
+    tenths = script.search_long(300)
+    assert [tenth.saccades for tenth in tenths] == list(range(30, 301, 30))
+    assert all(tenth.positive_definite for tenth in tenths)
+    informed = [tenth.information for tenth in tenths]
+    assert all(math.isfinite(value) for value in informed) and sorted(informed) == informed
+    assert tenths[-1].resident_mb - tenths[2].resident_mb < 20
+    assert tenths[-1].cpu_ms < 5 * min(tenth.cpu_ms for tenth in tenths[1:])
