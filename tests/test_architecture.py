@@ -79,6 +79,7 @@ FLOORS = (
         "update",
         "encoders",
         "moving",
+        "expected",
         "store",
     ),
     (

@@ -8,8 +8,9 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from torchfovea.rows import stack
-from torchfovea.search import Look, Move, Robot
+from torchfovea.memory.egosphere import Memory
+from torchfovea.rows import row, stack
+from torchfovea.search import Expecting, Look, Move, Robot
 from torchfovea.sensing.head import Gaze
 
 __all__ = ["Arena", "Arenas", "Fixation", "Truth"]
@@ -73,6 +74,12 @@ class Arenas:
     def saccade(self, gaze: Gaze) -> Move:
         """Move each head."""
         return Move(*stack([arena.saccade(one) for arena, one in self._each(gaze)]))
+
+    def expect(self, memory: Memory) -> None:
+        """Tell each that wants to know what is known."""
+        for b, arena in enumerate(self.arenas):
+            if isinstance(arena, Expecting):
+                arena.expect(row(memory, b))
 
     def look(self, gaze: Gaze, generators: Sequence[torch.Generator]) -> Look:
         """Sense at each gaze; the pictures are a list."""

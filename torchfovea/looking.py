@@ -7,16 +7,19 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchfovea.memory.egosphere import Memory
+from torchfovea.memory.expected import hidden_beyond
 from torchfovea.perception import Observer
 from torchfovea.search import Look
 from torchfovea.sensing.correspondence import Disparity
 from torchfovea.sensing.fields import draw_fields, for_all
+from torchfovea.sensing.head import Eyes, to_ego
 from torchfovea.setting import require
-from torchfovea.stereo.matchers import Match, checked_matches
-from torchfovea.stereo.sweep import SweepRange
+from torchfovea.stereo.matchers import Match, Narrowed, checked_matches
+from torchfovea.stereo.sweep import SweepRange, Volume
 from torchfovea.stereo.views import Views
 
-__all__ = ["Pictures", "look_at"]
+__all__ = ["Pictures", "look_at", "told"]
 
 
 class Pictures(NamedTuple):
@@ -60,3 +63,25 @@ def look_at(
         if chosen is not None:
             matches = for_all(matches.take(chosen), observer.retina)
     return Look(matches, Pictures(views.left, views.right, found))
+
+
+def told(matcher: Match, observer: Observer, memory: Memory | None, eyes: Eyes) -> Match:
+    """The matcher of one look, which knows from the memory where surfaces can be, if it asks.
+
+    Args:
+        matcher: any; one that is not `torchfovea.stereo.matchers.Narrowed` stays as it is.
+        observer: whose eyes these are.
+        memory: before the look; None: nothing is known.
+        eyes: where they are.
+    """
+    if memory is None or not isinstance(matcher, Narrowed):
+        return matcher
+    known = memory
+
+    def volume(sigmas: float) -> Volume:
+        centers_px = observer.retina.centers_px(known.cells.device, known.cells.dtype)
+        rays = to_ego(eyes.R_left.to(known.cells), observer.camera.rays(centers_px))
+        least = hidden_beyond(known, eyes.t_left.to(known.cells), rays, sigmas)
+        return Volume(least, torch.full_like(least, torch.inf))
+
+    return matcher.within(volume)

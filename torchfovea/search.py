@@ -24,7 +24,7 @@ from torchfovea.sensing.correspondence import Correspondences
 from torchfovea.sensing.head import Eyes, Gaze, Head, Kinematics, eyes, fixate, gaze_point
 from torchfovea.setting import require
 
-__all__ = ["Glance", "Look", "Move", "Robot", "StopRule", "search", "seen_from", "steadied"]
+__all__ = ["Expecting", "Glance", "Look", "Move", "Robot", "StopRule", "search", "seen_from", "steadied"]
 
 StopRule = tuple[float, float]
 """(tolerance, probability) of `torchfovea.deciding.acquisition.known_well_enough`."""
@@ -77,6 +77,15 @@ class Robot(Protocol):
             gaze: as the encoders told.
             generator: the search's, for a sensor that needs chance; of B robots one each.
         """
+        ...
+
+
+@runtime_checkable
+class Expecting(Protocol):
+    """A `Robot` that wants to know, before it looks, what is known; one that does not lacks this method."""
+
+    def expect(self, memory: Memory, /) -> None:
+        """Take what is known before the next look, of B robots with a leading axis; the base is where it is then."""
         ...
 
 
@@ -155,6 +164,8 @@ def _course(
         start = time.perf_counter()
         if move.base is not None:
             memory = _carried(observer, memory, move.base)
+        if isinstance(robot, Expecting):
+            robot.expect(memory)
         look, looked = robot.look(executed, generator), ~done
         require(look is None or isinstance(look, Look), "robot.look", type(look).__name__, "a torchfovea.search.Look")
         if look is None:

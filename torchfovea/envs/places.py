@@ -205,7 +205,9 @@ class RobotPlaces:
         self, rows: Sequence[int], memory: Memory, gaze: Gaze, generators: Generators
     ) -> tuple[Memory, Look | None]:
         """See `SearchPlaces`."""
-        look = self._some(rows).look(gaze, generators)
+        robots = self._some(rows)
+        robots.expect(memory)
+        look = robots.look(gaze, generators)
         return perceive(self.observer, memory, look.matches, eyes(self.observer.head, gaze)), look
 
 

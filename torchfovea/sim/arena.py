@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from torchfovea.arena import Fixation, Truth
-from torchfovea.looking import Pictures, look_at
+from torchfovea.looking import Pictures, look_at, told
+from torchfovea.memory.egosphere import Memory
 from torchfovea.memory.moving import Motion
 from torchfovea.perception import Observer
 from torchfovea.recordings.folder import Recorder
@@ -58,6 +59,7 @@ class SimulatedArena:
         self.seconds, self.route = 0.0, route
         self.base: Motion | None = None  # of the last saccade
         self._steps = -1
+        self._memory: Memory | None = None
         if route is not None:
             world.stand(route.pose(0))
 
@@ -110,6 +112,10 @@ class SimulatedArena:
         seen = self.world.fixated(self._true(gaze))
         return Fixation(seen.point_e, seen.range_m, seen.is_floor, seen.is_target)
 
+    def expect(self, memory: Memory) -> None:
+        """Take what is known before the next look, for a matcher that asks."""
+        self._memory = memory
+
     def look(self, gaze: Gaze, generator: torch.Generator) -> Look:
         """Sense at a gaze; the generator draws the geometric sensor's noise."""
         observer = self.observer
@@ -138,7 +144,8 @@ class SimulatedArena:
         assert self.matcher is not None
         head, camera, retina = self.observer.head, self.observer.camera, self.observer.retina
         views = verged_views(left, right, rig_at(head, gaze), camera, retina.radius_px)
-        return look_at(self.observer, views, self.matcher, generator, self.sample)
+        matcher = told(self.matcher, self.observer, self._memory, eyes(head, gaze))
+        return look_at(self.observer, views, matcher, generator, self.sample)
 
     def truth(self, cells: Tensor) -> Truth:
         """What the judge knows as the robot stands now: the nearest point, and the surface behind each cell (Nx, 3)."""

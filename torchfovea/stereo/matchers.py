@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from torch import Tensor
@@ -12,10 +13,10 @@ from torchfovea.setting import SettingError, require
 from torchfovea.stereo.external import DisparityFunction, External, match_external
 from torchfovea.stereo.matching import match_sgbm
 from torchfovea.stereo.sgbm import SGBM
-from torchfovea.stereo.sweep import Sweep, SweepRange, match_sweep
+from torchfovea.stereo.sweep import Sweep, SweepRange, Volume, match_sweep
 from torchfovea.stereo.views import Views
 
-__all__ = ["Match", "Matcher", "checked_matches"]
+__all__ = ["Match", "Matcher", "Narrowed", "checked_matches"]
 
 
 @runtime_checkable
@@ -37,19 +38,45 @@ class Match(Protocol):
         ...
 
 
+@runtime_checkable
+class Narrowed(Protocol):
+    """A `Match` that may ask where to look; one that does not lacks this method."""
+
+    def within(self, volume: Callable[[float], Volume], /) -> Match:
+        """The `Match` of one look.
+
+        Args:
+            volume: tells where surfaces can be, so many standard deviations behind what is known; it costs time.
+        """
+        ...
+
+
 class Matcher(NamedTuple):
-    """A built-in matcher with its parameters; it is a `Match`.
+    """A built-in matcher with its parameters; it is a `Match`, and `Narrowed`.
 
     Attributes:
         params: their type says which matcher it is.
         nearest_m: nearest range that is searched or believed [m].
         source: of an external matcher: a function of two images or its name ``package.module:function``, or for a
             rectified pair a disparity file.
+        volume: where the sweep looks; None: everywhere.
     """
 
     params: SGBM | Sweep | External
     nearest_m: float = 0.3
     source: str | DisparityFunction | None = None
+    volume: Volume | None = None
+
+    @property
+    def asks(self) -> bool:
+        """Whether the memory tells it where to look: ``matcher.volume=memory``."""
+        return isinstance(self.params, Sweep) and self.params.volume == "memory"
+
+    def within(self, volume: Callable[[float], Volume], /) -> Matcher:
+        """See `Narrowed`."""
+        if not (isinstance(self.params, Sweep) and self.asks):
+            return self
+        return self._replace(volume=volume(self.params.volume_sigmas))
 
     def __call__(
         self, views: Views, retina: Retina | None, budget: Budget, /
@@ -63,7 +90,7 @@ class Matcher(NamedTuple):
         if isinstance(params, SGBM):
             return match_sgbm(views, retina, params, budget, self.nearest_m)
         if isinstance(params, Sweep):
-            return match_sweep(views, retina, params, budget, self.nearest_m)
+            return match_sweep(views, retina, params, budget, self.nearest_m, volume=self.volume)
         expected = "package.module:function, or a disparity file for a rectified pair"
         if self.source is None:
             raise SettingError(f"matcher.source = None: expected {expected}")

@@ -40,7 +40,9 @@ class Sweep:
         winner_widths: standard deviation of a surface's refinements about their surroundings', in RF widths; what is
             known of a match without texture is what is known of its surroundings.
         temperature: scales the variance that the images give.
-        volume_sigmas: half the depth of a volume of interest, in standard deviations.
+        volume: where to look: `all`, or `memory`: nothing behind the surfaces that the memory is sure of
+            (`torchfovea.memory.expected`).
+        volume_sigmas: how far behind these it still looks, in standard deviations of their inverse range.
     """
 
     window: int = 1
@@ -56,6 +58,7 @@ class Sweep:
     left_right: bool = True
     winner_widths: float = 0.2
     temperature: float = 1.0
+    volume: str = "all"
     volume_sigmas: float = 3.0
 
     def __post_init__(self) -> None:
@@ -70,6 +73,7 @@ class Sweep:
         large = self.smooth_small <= self.smooth_large < math.inf
         require(0 <= self.smooth_small < math.inf, "matcher.smooth_small", self.smooth_small, "0 or more")
         require(large, "matcher.smooth_large", self.smooth_large, f"at least smooth_small = {self.smooth_small}")
+        require(self.volume in ("all", "memory"), "matcher.volume", self.volume, "all or memory")
         require(-1 <= self.correlation < 1, "matcher.correlation", self.correlation, "-1 to less than 1")
         require(0 <= self.uniqueness < math.inf, "matcher.uniqueness", self.uniqueness, "0 or more")
         for name in ("contrast", "noise", "winner_widths", "temperature", "volume_sigmas"):

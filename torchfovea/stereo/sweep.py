@@ -60,12 +60,12 @@ class Volume(NamedTuple):
     It limits the search and is no prior: fused with the memory it came from, the result does not count twice.
 
     Attributes:
-        inverse_range: (N,) or (B, N), expected along each left RF's ray, from the left eye [1/m].
-        sigma: the same shape, its standard deviation; infinite: anywhere.
+        least: (N,) or (B, N), least inverse range along each left RF's ray, from the left eye [1/m]; 0: however far.
+        most: the same shape, greatest; infinite: however near.
     """
 
-    inverse_range: Tensor
-    sigma: Tensor
+    least: Tensor
+    most: Tensor
 
 
 def match_sweep(
@@ -113,9 +113,7 @@ def match_sweep(
     length = ray.detach().square().sum(-1).sqrt()
     low, high = (length.new_full((batch, retina.count), bound) for bound in widest)
     if volume is not None:
-        low, high = (
-            b.clamp(*widest) for b in _interval(volume, retina, length.expand(batch, -1), params.volume_sigmas)
-        )
+        low, high = (bound.clamp(*widest) for bound in _depths(volume, retina, length.expand(batch, -1)))
     parts = [
         match_sheet(eye, sheet, params, low, high) for sheet in sheets(retina, 1 / eye.scale, pair.device, pair.dtype)
     ]
@@ -166,12 +164,12 @@ def match_sweep(
     return matches, SweepRange(inverse_range, sigma, correlation, valid, clues)
 
 
-def _interval(volume: Volume, retina: Retina, length: Tensor, sigmas: float) -> tuple[Tensor, Tensor]:
+def _depths(volume: Volume, retina: Retina, length: Tensor) -> tuple[Tensor, Tensor]:
     """A volume's least and greatest inverse depth, (B, N)."""
     for name, value in zip(Volume._fields, volume, strict=True):
         fits = value.shape in ((retina.count,), tuple(length.shape))
         require(fits, f"volume.{name}.shape", tuple(value.shape), f"({retina.count},) or {tuple(length.shape)}")
         require(not bool(value.isnan().any()), f"volume.{name}", "NaN", "numbers")
-    require(bool((volume.sigma > 0).all()), "volume.sigma", float(volume.sigma.min()), "more than 0")
-    mean, half = (v.detach().to(length) for v in (volume.inverse_range, volume.sigma * sigmas))
-    return (mean - half) * length, (mean + half) * length
+    require(bool((volume.least <= volume.most).all()), "volume.most", "less than volume.least", "at least as much")
+    least, most = (bound.detach().to(length) for bound in volume)
+    return least * length, most * length

@@ -74,7 +74,7 @@ def run(cfg: DictConfig) -> float:
     alone = not watched or workers_of(cfg)[0] == 1
     require(alone, "workers", cfg.workers, "1 with viewer or video, which follow the last episode")
     # mistakes come first, also in what is not used
-    build_strategy(cfg, observer), build_match(cfg), build_motor(cfg), build_route(cfg), build_noise(cfg)
+    build_strategy(cfg, observer), build_match(cfg, observer), build_motor(cfg), build_route(cfg), build_noise(cfg)
     loaded_memory(cfg, observer), check_resample(cfg, observer)
     saved = memory_path(cfg, "memory.save")
     done = finished(cfg, folder)

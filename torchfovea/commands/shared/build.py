@@ -207,7 +207,7 @@ def build_arena(cfg: DictConfig, observer: Observer, seed: int) -> SimulatedAren
         noise=build_noise(cfg),
         seed=seed,
     )
-    match = build_match(cfg)  # checked even where it is not used
+    match = build_match(cfg, observer)  # checked even where it is not used
     sample = None if OmegaConf.select(cfg, "sensor.sample") is None else whole(cfg, "sensor.sample", 16)
     geometric, route = fidelity == "geometric", build_route(cfg)
     return SimulatedArena(world, observer, None if geometric else match, sample, seed, route)
@@ -222,8 +222,13 @@ def build_route(cfg: DictConfig) -> Route | None:
     return route
 
 
-def build_match(cfg: DictConfig) -> Match:
-    """The stereo matcher, built in or a user's own."""
+def build_match(cfg: DictConfig, observer: Observer | None = None) -> Match:
+    """The stereo matcher, built in or a user's own.
+
+    Args:
+        cfg: with the group matcher.
+        observer: whose memory the matcher may ask; None: there is none.
+    """
     name_of(cfg, "matcher")
     form = "a function (views, retina, budget) that returns (Correspondences, found)"
     target = OmegaConf.select(cfg, "matcher._target_") or targets_of("matcher", "name").get(cfg.matcher.name)
@@ -234,7 +239,11 @@ def build_match(cfg: DictConfig) -> Match:
         if isinstance(source, DictConfig):
             source = build_named(cfg, "matcher.source", "a function (left, right) that returns a disparity", ())
             require(callable(source), "matcher.source", type(source).__name__, "a function (left, right)")
-        return Matcher(made, number(cfg, "matcher.nearest_range_m"), source)
+        matcher = Matcher(made, number(cfg, "matcher.nearest_range_m"), source)
+        knows = observer is not None and observer.fusion.votes
+        expected = "all, or search with fusion=inverse_range, whose memory tells where to look"
+        require(knows or not matcher.asks, "matcher.volume", "memory", expected)
+        return matcher
     require(callable(made), "matcher", type(made).__name__, form)
     match: Match = made
     return match
