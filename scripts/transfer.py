@@ -1,0 +1,67 @@
+"""Do biases that `torchfovea tune` found carry over to the full simulator? `python scripts/transfer.py RUN [settings]`.
+
+Plays tuned, fitted, remembered, hand and the best of Table 1 on the same scenes, each with the α that the run has
+chosen for it, by `torchfovea search`; whatever follows RUN is passed on (memory.cells=20000, head=human, ...).
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import re
+import tempfile
+from pathlib import Path
+
+import torch
+
+from torchfovea.cli import main
+from torchfovea.studies.significance import bootstrap_interval
+from torchfovea.tuning.baselines import TABLE_1
+
+OURS = ("tuned", "fitted", "remembered", "hand")
+
+
+def chosen(run: Path, name: str) -> list[str]:
+    """α and field of view, as the note in a bias's file has them."""
+    note = (run / "memory" / f"{name}.yaml").read_text(encoding="utf-8").splitlines()[0]
+    return re.findall(r"(?:acquisition\.alpha|sensor\.fov_deg)=[\d.e+-]+", note)
+
+
+def play(run: Path, out: Path, name: str, scene: str, settings: list[str]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Found and gap of each scene."""
+    alike = ["fidelity=geometric", "profile=reduced", "episodes=40", "saccades=10", "batch=8", "picture=false"]
+    own = chosen(run, name) if name in OURS else [*chosen(run, "hand")[1:], "acquisition.alpha=1"]
+    where = [f"--config-dir={run}", f"memory={name}", f"scene={scene}", f"hydra.run.dir={out / name}"]
+    if main(["search", *where, *alike, *own, *settings]) != 0:
+        raise SystemExit(1)
+    with (out / name / "episodes.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    return tuple(torch.tensor([float(row[key]) for row in rows]) for key in ("found", "gap_per_saccade"))
+
+
+def told(values: torch.Tensor) -> str:
+    """Mean and 95% interval."""
+    mean, low, high = (float(v) for v in bootstrap_interval(values, torch.Generator().manual_seed(0)))
+    return f"{mean:.3f} ({low:.3f} to {high:.3f})"
+
+
+def compare(run: Path, settings: list[str]) -> None:
+    """Print a line for each policy; differences are paired over scenes."""
+    scores = json.loads((run / "result.json").read_text(encoding="utf-8"))
+    best = max(TABLE_1, key=lambda name: scores[f"heldout.{name}.gap_per_saccade"])
+    scene = sorted(path.stem for path in (run / "scene").glob("*.yaml"))[0]
+    with tempfile.TemporaryDirectory() as folder:
+        found = {name: play(run, Path(folder), name, scene, settings) for name in (*OURS, best)}
+    print("policy, found, gap per saccade (95%), tuned minus it (95%)")
+    for name, (hit, gap) in found.items():
+        behind = "-" if name == "tuned" else told(found["tuned"][1] - gap)
+        print(f"{name}, {float(hit.mean()):.2f}, {told(gap)}, {behind}")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path, help="folder of a finished run of torchfovea tune")
+    parser.add_argument("settings", nargs="*", help="of torchfovea search")
+    given = parser.parse_args()
+    compare(given.run.resolve(), given.settings)
