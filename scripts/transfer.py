@@ -16,6 +16,7 @@ from pathlib import Path
 import torch
 
 from torchfovea.cli import main
+from torchfovea.setting import require
 from torchfovea.studies.significance import bootstrap_interval
 from torchfovea.tuning.baselines import TABLE_1
 
@@ -25,7 +26,9 @@ OURS = ("tuned", "fitted", "remembered", "hand")
 def chosen(run: Path, name: str) -> list[str]:
     """α and field of view, as the note in a bias's file has them."""
     note = (run / "memory" / f"{name}.yaml").read_text(encoding="utf-8").splitlines()[0]
-    return re.findall(r"(?:acquisition\.alpha|sensor\.fov_deg)=[\d.e+-]+", note)
+    found = re.findall(r"(?:acquisition\.alpha|sensor\.fov_deg)=[\d.e+-]+", note)
+    require(len(found) == 2, f"{name}.yaml", note, "a first line that names acquisition.alpha and sensor.fov_deg")
+    return found
 
 
 def play(run: Path, out: Path, name: str, scene: str, settings: list[str]) -> tuple[torch.Tensor, torch.Tensor]:
