@@ -17,7 +17,7 @@ from torchfovea.commands.calibrate.simulated import SceneTask, looks_at_scenes
 from torchfovea.commands.calibrate.truths import Truths, look_at_pair
 from torchfovea.commands.shared.budgets import build_budget, made_for, write_budget
 from torchfovea.commands.shared.build import build_matcher, build_sensor, construct, whole
-from torchfovea.commands.shared.config import run_folder
+from torchfovea.commands.shared.config import run_folder, sized
 from torchfovea.commands.shared.pairs import gaze_of, load_pair, named_pair
 from torchfovea.commands.shared.parallel import workers_of
 from torchfovea.commands.shared.unread import refuse_unread
@@ -62,7 +62,7 @@ class Split(NamedTuple):
 def run(cfg: DictConfig) -> float:
     """Calibrate; the mixture's negative log-likelihood of what was judged on is what a sweeper sees."""
     refuse_unread("sensor.sample")
-    cfg = _sized(cfg)
+    cfg = sized(cfg, QUICK, FULL)
     scenes, judged_scenes = whole(cfg, "scenes", 0), whole(cfg, "judged_scenes")
     whole(cfg, "looks"), whole(cfg, "seed", 0), workers_of(cfg)
     require(isinstance(cfg.real, bool), "real", cfg.real, "true or false")
@@ -234,13 +234,3 @@ def _edges(cfg: DictConfig, setting: str, least: int = 2) -> list[float]:
     count = {1: "ascending numbers", 2: "two or more ascending numbers"}[least]
     require(good and all(a < b for a, b in pairwise(values)), setting, values, count)
     return [float(v) for v in values]
-
-
-def _sized(cfg: DictConfig) -> DictConfig:
-    """The configuration with the profile's sizes where a setting is null."""
-    sizes = QUICK if HydraConfig.get().runtime.choices.get("profile") == "quick" else FULL
-    cfg = cfg.copy()
-    for setting, value in sizes.items():
-        if OmegaConf.select(cfg, setting) is None:
-            OmegaConf.update(cfg, setting, value)
-    return cfg

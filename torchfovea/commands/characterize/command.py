@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
@@ -16,7 +15,7 @@ from torch import Tensor
 
 from torchfovea.commands.characterize.honesty import CHUNK, plan_cases, plan_planes, propagate, realise, wholes
 from torchfovea.commands.shared.build import build_camera, build_matcher, construct, number, whole
-from torchfovea.commands.shared.config import run_folder
+from torchfovea.commands.shared.config import run_folder, sized
 from torchfovea.commands.shared.manifest import complete, finished
 from torchfovea.commands.shared.progress import progress_bar
 from torchfovea.commands.shared.unread import refuse_unread
@@ -50,7 +49,7 @@ FULL = {"distances": 20, "vergences": 31, "propagation.samples": 1 << 20, "reali
 def run(cfg: DictConfig) -> float:
     """Characterize both sensors; the smallest advantage of the foveal one is what a sweeper sees."""
     refuse_unread("budget.source", "budget.sigma_points")
-    cfg = _sized(cfg)
+    cfg = sized(cfg, QUICK, FULL)
     for name in ("propagation.run", "realised.run"):
         asked = OmegaConf.select(cfg, name)
         require(isinstance(asked, bool), name, asked, "true or false")
@@ -94,16 +93,6 @@ def run(cfg: DictConfig) -> float:
     complete(folder, figures)
     _print(figures)
     return float(figures["foveal_advantage_min_nats"] or 0.0)
-
-
-def _sized(cfg: DictConfig) -> DictConfig:
-    """The configuration with the profile's sizes where a setting is null."""
-    sizes = QUICK if HydraConfig.get().runtime.choices.get("profile") == "quick" else FULL
-    cfg = cfg.copy()
-    for setting, value in sizes.items():
-        if OmegaConf.select(cfg, setting) is None:
-            OmegaConf.update(cfg, setting, value)
-    return cfg
 
 
 def _sensors(cfg: DictConfig) -> dict[str, PlaneSensor]:

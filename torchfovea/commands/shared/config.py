@@ -7,11 +7,11 @@ from typing import Any, ClassVar
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 import torchfovea
 
-__all__ = ["SweepFolder", "conf_dir", "help_text", "run_folder"]
+__all__ = ["SweepFolder", "conf_dir", "help_text", "run_folder", "sized"]
 
 
 def conf_dir() -> str:
@@ -24,6 +24,16 @@ def conf_dir() -> str:
 def run_folder() -> Path:
     """The running job's own folder (Hydra made it); only inside a job."""
     return Path(HydraConfig.get().runtime.output_dir)
+
+
+def sized(cfg: DictConfig, quick: dict[str, Any], full: dict[str, Any]) -> DictConfig:
+    """The configuration with the profile's sizes, `quick` or `full`, where a setting is null."""
+    sizes = quick if HydraConfig.get().runtime.choices.get("profile") == "quick" else full
+    cfg = cfg.copy()
+    for setting, value in sizes.items():
+        if OmegaConf.select(cfg, setting) is None:
+            OmegaConf.update(cfg, setting, value)
+    return cfg
 
 
 def help_text(command: str) -> str:
