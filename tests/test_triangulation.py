@@ -11,6 +11,7 @@ from kornia.geometry.epipolar import triangulate_points
 from scipy.optimize import least_squares
 
 from torchfovea.gaussian import Gaussian, quadratic3, unpack
+from torchfovea.rows import stack
 from torchfovea.sensing import triangulation
 from torchfovea.sensing.camera import Fisheye, Pinhole
 from torchfovea.sensing.chart import cartesian_from_inverse_range, inverse_range_coordinates
@@ -238,7 +239,7 @@ def test_batch_is_loop():
     points = cloud(6, 9)
     gazes = fixate(HEAD, points[:2])[0]
     many = [stereo(points, 0.1, Gaze(*(g[i] for g in gazes))) for i in range(2)]
-    matches = Correspondences(*(torch.stack(pair) for pair in zip(*(m for m, _ in many), strict=True)))
+    matches = stack([m for m, _ in many])
     whole = observe(matches, eyes(HEAD, gazes), CAMERA, HALF)
     for i, (m, pose) in enumerate(many):
         for a, b in zip(whole[:6], observe(m, pose, CAMERA, HALF)[:6], strict=True):
@@ -293,7 +294,7 @@ def test_pieces_are_the_whole(monkeypatch):
     points = cloud(101, 8)
     gazes = fixate(HEAD, points[:3])[0]
     many = [stereo(points, 0.1, Gaze(*(g[i] for g in gazes))) for i in range(3)]
-    matches = Correspondences(*(torch.stack(pair) for pair in zip(*(m for m, _ in many), strict=True)))
+    matches = stack([m for m, _ in many])
     for chart in ("inverse_range", "cartesian"):
         whole = observe(matches, eyes(HEAD, gazes), CAMERA, HALF, chart=chart)
         for block in (1, 40, 302):
@@ -302,8 +303,8 @@ def test_pieces_are_the_whole(monkeypatch):
                 pieces = observe(matches, eyes(HEAD, gazes), CAMERA, HALF, chart=chart)
             for a, b in zip(pieces[:6], whole[:6], strict=True):
                 torch.testing.assert_close(a, b)
-    none = observe(Correspondences(*(t[..., :0, :] if t.dim() == 3 else t[..., :0] for t in matches)),
-                   eyes(HEAD, gazes), CAMERA, HALF)  # fmt: skip
+    cut = (None if t is None else t[..., :0, :] if t.dim() == 3 else t[..., :0] for t in matches)
+    none = observe(Correspondences(*cut), eyes(HEAD, gazes), CAMERA, HALF)
     assert none.mean.shape == (3, 0, 3) and none.cov.shape == (3, 0, 6) and none.valid.shape == (3, 0)
 
 
@@ -337,8 +338,9 @@ def test_what_is_not_valid_has_no_part_in_a_gradient(chart, camera):
     place = places.repeat(5, 1)
     sigma = torch.tensor([0.0, 0.3, NAN, INF, 1e300], dtype=torch.float64).repeat_interleave(5)
     claimed = torch.arange(25) == 0
-    parts = (place, -place, sigma, sigma, claimed, *[torch.ones_like(sigma)] * 3)
-    mixed = Correspondences(*(torch.cat(pair) for pair in zip(clean, parts, strict=True)))
+    parts = (place, -place, sigma, sigma, claimed, *[torch.ones_like(sigma)] * 3, None)
+    pairs = zip(clean, parts, strict=True)
+    mixed = Correspondences(*(None if one is None else torch.cat((one, other)) for one, other in pairs))
 
     def gradients(matches):
         gaze = [torch.tensor(a, dtype=torch.float64, requires_grad=True) for a in (0.05, -0.02, 0.12)]
