@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -110,6 +111,7 @@ def trained(
         found: Policy = load_function(policy, "acquisition.policy", "FILE.zip or package.module:function")
         rows, columns = map_shape or (12, 20)
         return policy_strategy(found, observer, action or "fixation", (rows, columns))
+    require(Path(policy).is_file(), "acquisition.policy", policy, "an existing FILE.zip")
     from stable_baselines3 import PPO
 
     try:
