@@ -27,7 +27,7 @@ from torchfovea.sensing.sampling import constant, place, read, sampling, wide
 from torchfovea.sensing.triangles import from_triangles
 from torchfovea.setting import require
 
-__all__ = ["LogPolar", "Retina", "Uniform", "cortical", "covered", "fovea", "interpolate", "reconstruct"]
+__all__ = ["LogPolar", "Retina", "Uniform", "cortical", "covered", "fovea", "interpolate", "kept", "reconstruct"]
 
 
 def fovea(image: Tensor, gaze_px: Tensor | None, retina: Retina, scale: float | None = None) -> Tensor:
@@ -170,6 +170,14 @@ def reconstruct(
     mask = retina.inside(px)
     image = interpolate(values, retina, px)
     return torch.where(mask, image, torch.zeros_like(image)), mask
+
+
+def kept(image: Tensor, retina: Retina) -> Tensor:
+    """What a retina that looks at the middle of an image (C, H, W) keeps of it, as an image (C, H, W).
+
+    It is 0 off the retina. Differentiable.
+    """
+    return reconstruct(fovea(image[None], None, retina), retina, (image.shape[-2], image.shape[-1]))[0][0]
 
 
 def _checked_scale(size: tuple[int, ...] | torch.Size, retina: Retina, scale: float | None) -> float:

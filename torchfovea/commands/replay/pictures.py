@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfovea.commands.shared.pictures import found_map, sphere_map
+from torchfovea.commands.shared.pictures import azimuth_elevation, found_map, sphere_map
 from torchfovea.files import write_figure
 from torchfovea.search import Glance
 from torchfovea.sensing.correspondence import Disparity
@@ -69,7 +69,7 @@ def draw_replay(
     _in_colour(right, memory.cells, torch.where(seen[:, None], colours, torch.full_like(colours, 0.9)))
     right.set_title("memory: colours, and where the head looked")
     if int(last.step.cell) >= 0:
-        left.plot(*_degrees(memory.cells[last.step.cell][None]), "o", mfc="none", mec="crimson", ms=14, mew=2)
+        left.plot(*azimuth_elevation(memory.cells[last.step.cell][None]), "o", mfc="none", mec="crimson", ms=14, mew=2)
     pan, tilt = (np.degrees([row[k] for row in rows]) for k in (2, 3))
     right.plot(pan, -tilt, ".-", color="black", lw=0.8)
     for axes in (left, right):
@@ -77,12 +77,7 @@ def draw_replay(
     write_figure(path, figure, dpi=80)
 
 
-def _degrees(directions: Tensor) -> tuple[Tensor, Tensor]:
-    azimuth = torch.rad2deg(torch.atan2(directions[:, 1], directions[:, 0]))
-    return azimuth, torch.rad2deg(torch.asin(directions[:, 2].clamp(-1, 1)))
-
-
 def _in_colour(axes: Axes, cells: Tensor, colours: Tensor) -> None:
-    axes.scatter(*_degrees(cells), c=np.asarray(colours.clamp(0, 1)), s=4, linewidths=0, rasterized=True)
+    axes.scatter(*azimuth_elevation(cells), c=np.asarray(colours.clamp(0, 1)), s=4, linewidths=0, rasterized=True)
     axes.set(xlabel="azimuth [°] (left is positive)", ylabel="elevation [°]", aspect="equal")
     axes.invert_xaxis()

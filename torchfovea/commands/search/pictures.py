@@ -8,15 +8,14 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import torch
-from torch import Tensor
 
-from torchfovea.commands.shared.pictures import found_map, sphere_map
+from torchfovea.commands.shared.pictures import azimuth_elevation, found_map, sphere_map
 from torchfovea.episode import Episode
 from torchfovea.files import write_figure
 from torchfovea.metrics import information
 from torchfovea.sensing.correspondence import Disparity
 from torchfovea.sensing.layout import Retina
-from torchfovea.sensing.retina import fovea, reconstruct
+from torchfovea.sensing.retina import kept
 from torchfovea.stereo.sweep import SweepRange
 
 matplotlib.use("Agg")
@@ -28,12 +27,6 @@ __all__ = ["draw_episode"]
 DARK = "0.15"
 
 
-def _kept(image: Tensor, retina: Retina) -> np.ndarray:
-    """What the retina keeps of an image (3, H, W), as pixels (H, W, 3)."""
-    kept, _ = reconstruct(fovea(image[None], None, retina), retina, (image.shape[-2], image.shape[-1]))
-    return np.asarray(kept[0].movedim(0, -1).clamp(0, 1))
-
-
 def _cross(axes: Axes, size: Sequence[int]) -> None:
     """Mark the fixation: the optical axis."""
     height, width = size[-2:]
@@ -43,8 +36,7 @@ def _cross(axes: Axes, size: Sequence[int]) -> None:
 
 def _scan_path(axes: Axes, episode: Episode) -> None:
     """The fixations in order over a sphere map: the directions in E of the fixated points."""
-    azimuth = torch.rad2deg(torch.atan2(episode.direction[:, 1], episode.direction[:, 0]))
-    elevation = torch.rad2deg(torch.asin(episode.direction[:, 2].clamp(-1, 1)))
+    azimuth, elevation = azimuth_elevation(episode.direction)
     axes.plot(azimuth, elevation, "-", color="white", lw=2.2, alpha=0.8)
     axes.plot(azimuth, elevation, "-", color=DARK, lw=0.9)
     axes.scatter(
@@ -81,7 +73,7 @@ def draw_episode(path: Path, episode: Episode, retina: Retina, title: str) -> No
         left, right = shown.left.detach().cpu().float(), shown.right.detach().cpu().float()
         for axes, picture, name in zip(
             row,
-            (left.movedim(0, -1), right.movedim(0, -1), _kept(left, retina)),
+            (left.movedim(0, -1), right.movedim(0, -1), kept(left, retina).movedim(0, -1)),
             ("left eye", "right eye", "what the left retina keeps"),
             strict=False,
         ):

@@ -14,14 +14,14 @@ from torchfovea.metrics import information
 from torchfovea.search import Glance
 from torchfovea.sensing.correspondence import Disparity
 from torchfovea.sensing.layout import Retina
-from torchfovea.sensing.retina import fovea, reconstruct
+from torchfovea.sensing.retina import kept, reconstruct
 from torchfovea.stereo.sweep import SweepRange
 
 matplotlib.use("Agg")
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-__all__ = ["draw_glance", "found_map", "sphere_map"]
+__all__ = ["azimuth_elevation", "draw_glance", "found_map", "sphere_map"]
 
 
 def found_map(found: Disparity | SweepRange, retina: Retina | None, size_px: int) -> tuple[np.ndarray, str]:
@@ -42,12 +42,17 @@ def found_map(found: Disparity | SweepRange, retina: Retina | None, size_px: int
     return np.asarray(torch.where(weight > 0.5, value / weight.clamp(min=0.5), torch.nan)), "inverse range found [1/m]"
 
 
+def azimuth_elevation(directions: Tensor) -> tuple[Tensor, Tensor]:
+    """Where unit directions (..., 3) in E lie on a sphere map [degrees]."""
+    x, y, z = directions.unbind(-1)
+    return torch.rad2deg(torch.atan2(y, x)), torch.rad2deg(torch.asin(z.clamp(-1, 1)))
+
+
 def sphere_map(
     axes: Axes, cells: Tensor, values: Tensor, label: str, cmap: str, limits: tuple[float, float], size: float = 4.0
 ) -> Any:
     """Cells of an ego-sphere over azimuth (left is left) and elevation, coloured by a value."""
-    azimuth = torch.rad2deg(torch.atan2(cells[:, 1], cells[:, 0]))
-    elevation = torch.rad2deg(torch.asin(cells[:, 2].clamp(-1, 1)))
+    azimuth, elevation = azimuth_elevation(cells)
     drawn = axes.scatter(
         azimuth, elevation, c=values, s=size, cmap=cmap, vmin=limits[0], vmax=limits[1], linewidths=0, rasterized=True
     )
@@ -74,10 +79,9 @@ def draw_glance(glance: Glance, path: Tensor, nats: Sequence[float], retina: Ret
     parts = figure.subfigures(2, 1, squeeze=False)[:, 0] if shown is not None else [figure]
     if shown is not None:
         left, right = (image.detach().cpu().float() for image in (shown.left, shown.right))
-        kept = reconstruct(fovea(left[None], None, retina), retina, (left.shape[-2], left.shape[-1]))[0][0]
         row = parts[0].subplots(1, 3)
         names = "left eye", "right eye", "what the left retina keeps"
-        for axes, image, name in zip(row, (left, right, kept), names, strict=True):
+        for axes, image, name in zip(row, (left, right, kept(left, retina)), names, strict=True):
             axes.imshow(np.asarray(image.movedim(0, -1)).clip(0, 1))
             axes.plot((image.shape[-1] - 1) / 2, (image.shape[-2] - 1) / 2, "+", color="white", ms=12, mew=2)
             axes.set_title(name)
@@ -92,13 +96,12 @@ def draw_glance(glance: Glance, path: Tensor, nats: Sequence[float], retina: Ret
     for axes, name in zip(wide, ("range of the seen cells", "information"), strict=False):
         axes.set_title(name)
         axes.set_facecolor("0.9")
-        azimuth, elevation = torch.rad2deg(torch.atan2(path[:, 1], path[:, 0])), torch.rad2deg(torch.asin(path[:, 2]))
+        azimuth, elevation = azimuth_elevation(path)
         axes.plot(azimuth, elevation, ".-", color="white", lw=2.4, ms=8)
         axes.plot(azimuth, elevation, ".-", color="0.15", lw=1, ms=5)
         if int(glance.step.cell) >= 0:
-            x, y, z = memory.cells[glance.step.cell].tolist()
-            place = np.degrees([np.arctan2(y, x), np.arcsin(z)])
-            axes.plot(*place, "o", mfc="none", mec="tab:orange", ms=13, mew=2.2)
+            place = azimuth_elevation(memory.cells[glance.step.cell].cpu())
+            axes.plot(*map(float, place), "o", mfc="none", mec="tab:orange", ms=13, mew=2.2)
     wide[2].plot(range(1, len(nats) + 1), nats, ".-", color="tab:purple")
     wide[2].set(xlabel="fixation", ylabel="mean information [nats]")
     wide[2].grid(alpha=0.3)

@@ -18,7 +18,7 @@ from torchfovea.perception import Observer
 from torchfovea.search import Glance
 from torchfovea.sensing.correspondence import Disparity
 from torchfovea.sensing.head import eyes, gaze_point
-from torchfovea.sensing.retina import fovea, reconstruct
+from torchfovea.sensing.retina import kept
 
 __all__ = ["rerun_log"]
 
@@ -66,9 +66,8 @@ def _images(rr: Any, stream: Any, glance: Glance, observer: Observer) -> None:
     retina = observer.retina
     for name in ("left", "right"):
         image = getattr(pictures, name).detach().cpu().float()
-        kept = reconstruct(fovea(image[None], None, retina), retina, (image.shape[-2], image.shape[-1]))[0][0]
         stream.log(f"eyes/{name}/image", rr.Image(_bytes(image)))
-        stream.log(f"eyes/{name}/kept", rr.Image(_bytes(kept)))
+        stream.log(f"eyes/{name}/kept", rr.Image(_bytes(kept(image, retina))))
     if isinstance(pictures.found, Disparity):
         found = torch.where(pictures.found.valid, pictures.found.disparity, torch.zeros_like(pictures.found.disparity))
         stream.log("eyes/disparity_px", rr.DepthImage(found.detach().cpu().float().numpy(), meter=1.0))
