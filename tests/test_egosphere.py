@@ -437,7 +437,7 @@ def test_an_empty_memory_believes_the_prior(chart, dtype):
     moments, points = belief(memory), cartesian_belief(memory)
     assert moments.mean.dtype == points.cov.dtype == dtype
     torch.testing.assert_close(moments.cov[:, 5], torch.full((10,), 0.04, dtype=dtype))
-    torch.testing.assert_close(inverse3(memory.information.matrix), moments.cov)
+    torch.testing.assert_close(inverse3(memory.information.matrix).to(dtype), moments.cov)
     if chart == "cartesian":
         torch.testing.assert_close(moments.mean, 0.5 * cells)
         return
@@ -497,9 +497,10 @@ def test_a_memory_keeps_its_dtype(fusion):
     double = remember(memory, seen, how, common)
     single = remember(memory, rough, how, common.float())
     for a, b in zip(double.information, single.information, strict=True):
-        assert a.dtype == torch.float32
-        torch.testing.assert_close(a, b)
-    assert double.bearing.dtype == double.looks.dtype == torch.float32
+        assert a.dtype == torch.float64
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5)
+    kept = (double.bearing, double.looks, double.lasting, double.votes, belief(double).cov)
+    assert {part.dtype for part in kept} == {torch.float32}
 
 
 def test_priors_and_charts_that_float32_cannot_hold_are_named():

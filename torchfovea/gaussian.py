@@ -73,25 +73,23 @@ def unpack(sym: Tensor) -> Tensor:
 
 
 def inverse3(sym: Tensor) -> Tensor:
-    """Inverse of packed symmetric matrices by cofactors, (..., 6) to (..., 6).
+    """Inverse of packed symmetric positive definite matrices, (..., 6) to (..., 6), by their factors L D Lᵀ.
 
-    The matrix is first scaled to a unit diagonal, without which the determinant of a millimetre-thin, decimetre-long
-    covariance would underflow in float32. The diagonal must be positive.
+    Good to the rounding times the ratio of the eigenvalues, whatever the units of the axes; cofactors, whose determinant
+    multiplies the small eigenvalues, lose twice the digits.
     """
     xx, xy, xz, yy, yz, zz = sym.unbind(-1)
-    sx, sy, sz = xx.rsqrt(), yy.rsqrt(), zz.rsqrt()
-    xy, xz, yz = xy * sx * sy, xz * sx * sz, yz * sy * sz
-    c_xx, c_xy, c_xz = 1 - yz * yz, xz * yz - xy, xy * yz - xz
-    scale = 1 / (c_xx + xy * c_xy + xz * c_xz)
-    c_yy, c_yz, c_zz = 1 - xz * xz, xy * xz - yz, 1 - xy * xy
-    return columns(
-        c_xx * scale * sx * sx,
-        c_xy * scale * sx * sy,
-        c_xz * scale * sx * sz,
-        c_yy * scale * sy * sy,
-        c_yz * scale * sy * sz,
-        c_zz * scale * sz * sz,
-    )
+    one = 1 / xx
+    yx, zx = xy * one, xz * one
+    two = 1 / (yy - yx * xy)
+    left = yz - yx * xz
+    zy = left * two
+    i_zz = 1 / (zz - zx * xz - zy * left)
+    i_yz = -zy * i_zz
+    i_yy = two - zy * i_yz
+    i_xz = -zx * i_zz - yx * i_yz
+    i_xy = -yx * i_yy - zx * i_yz
+    return columns(one - yx * i_xy - zx * i_xz, i_xy, i_xz, i_yy, i_yz, i_zz)
 
 
 def positive_definite(sym: Tensor, tolerance: float | None = None) -> Tensor:

@@ -48,7 +48,9 @@ class Memory(NamedTuple):
 
     Attributes:
         cells: unit directions in E, (..., Nx, 3) (Eq. 20).
-        information: vector (..., Nx, 3) and packed matrix (..., Nx, 6), of (x, y, z) or of a patch (g₁, g₂, ρ).
+        information: vector (..., Nx, 3) and packed matrix (..., Nx, 6), of (x, y, z) or of a patch (g₁, g₂, ρ). These
+            sums are kept in float64 whatever the cells are: looks that are all alike tell ever more of one direction,
+            and in float32 their rounding would come to outweigh what is known of the others.
         bearing: how well the patches' places across the line of sight are known [1/rad²], (..., Nx); zero in x, y, z.
         looks: how many saccades brought each cell something, (..., Nx); 0 is unseen.
         lasting: (..., Nx, 2), what says how much of a patch's error no further look takes away. With u the variance of
@@ -159,11 +161,11 @@ def _prior_scalars(cells: Tensor, prior: Prior, chart: str) -> tuple[list[tuple[
 
 
 def prior_information(cells: Tensor, prior: Prior, chart: str = "inverse_range") -> tuple[Information, Tensor]:
-    """What every cell believes at first, and its bearing precision, in the shapes of `Memory`."""
-    zero = torch.zeros_like(cells[..., 0])
+    """What every cell believes at first, and its bearing precision, in the shapes and dtypes of `Memory`."""
+    zero = torch.zeros_like(cells[..., 0], dtype=torch.float64)
     ((x, xx), (y, yy), (z, zz)), bearing = _prior_scalars(cells, prior, chart)
     matrix = columns(zero + xx, zero, zero, zero + yy, zero, zero + zz)
-    return Information(columns(zero + x, zero + y, zero + z), matrix), zero + bearing
+    return Information(columns(zero + x, zero + y, zero + z), matrix), (zero + bearing).to(cells.dtype)
 
 
 def empty_memory(cells: Tensor, prior: Prior, chart: str = "inverse_range") -> Memory:
@@ -240,7 +242,7 @@ def belief(memory: Memory) -> Gaussian:
     Looks are averaged with their informations 1/u as weights. Of their variances u the parts l last, so that these err
     together: with Λ = Σ 1/u, the variance of the mean is (Λ − Σ l/u² + (Σ √l/u)²)/Λ². Differentiable.
     """
-    mean, cov = gaussian_from_information(memory.information)
+    mean, cov = (part.to(memory.cells.dtype) for part in gaussian_from_information(memory.information))
     *rest, variance = cov.unbind(-1)
     return Gaussian(mean, columns(*rest, variance + variance.square() * _together(memory)))
 
@@ -250,7 +252,7 @@ def inverse_range_belief(memory: Memory) -> tuple[Tensor, Tensor]:
 
     Differentiable.
     """
-    rho, variance = nearness(memory.information)
+    rho, variance = (part.to(memory.cells.dtype) for part in nearness(memory.information))
     return rho, variance + variance.square() * _together(memory)
 
 

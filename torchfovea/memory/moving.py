@@ -120,8 +120,7 @@ class _Moved(NamedTuple):
 
 def _carry(memory: Memory, step: Motion) -> _Moved:
     """Move what was seen but patches whose back or edge the robot would see now. Float64: planes mix scales."""
-    information = Information(*(part.double() for part in memory.information))
-    moments = gaussian_from_information(information)
+    moments = gaussian_from_information(memory.information)
     rotation = step.rotation.mT.to(memory.cells.device)
     shift, noise = step.translation.to(memory.cells.device), step.covariance.to(memory.cells.device)
     seen, chart = memory.looks > 0, memory.chart
@@ -301,7 +300,7 @@ def resample(memory: Memory, cells: Tensor, fusion: Fusion) -> Memory:
     source, target = torch.cat([old, old[nearest[extra]]]), torch.cat([target, extra])
     share = 1 / torch.bincount(source, minlength=len(memory.cells))[source].double()
     first, bearing = prior_information(memory.cells, prior, chart)
-    vector, matrix = ((now - then).double()[source] for now, then in zip(memory.information, first, strict=True))
+    vector, matrix = ((now - then)[source] for now, then in zip(memory.information, first, strict=True))
     if chart == "inverse_range":
         turn = _frame(cells[target].double()) @ _frame(memory.cells[source].double()).mT
         vector, matrix = (turn @ vector[..., None])[..., 0], rotate3(turn, matrix)
@@ -309,8 +308,9 @@ def resample(memory: Memory, cells: Tensor, fusion: Fusion) -> Memory:
     parts = torch.cat([*sums, memory.lasting.double()[source], memory.votes.double()[source]], -1) * share[:, None]
     parts[:, 11] *= share  # the second sum of `lasting` is of squares
     total = torch.zeros(len(cells), 14, dtype=parts.dtype, device=cells.device).index_add(0, target, parts)
-    total = columns(*total.to(cells.dtype).unbind(-1))
+    total = columns(*total.unbind(-1))
     information = Information(empty.information.vector + total[..., :3], empty.information.matrix + total[..., 3:9])
+    total = total.to(cells.dtype)
     looks = empty.looks.scatter_reduce(0, target, gather_columns(memory.looks[:, None], source)[:, 0], "amax")
     lasting, votes = columns(*total[..., 10:12].unbind(-1)), columns(*total[..., 12:].unbind(-1))
     bearing = empty.bearing + total[..., 9]

@@ -18,7 +18,7 @@ class Pooled(NamedTuple):
     """What one saccade tells about each cell.
 
     Attributes:
-        information: (..., Nx, 3) and (..., Nx, 6), zero where nothing came.
+        information: (..., Nx, 3) and (..., Nx, 6), zero where nothing came; of patches in float64, as the memory's.
         bearing: see `Memory`, (..., Nx).
         hits: number of observations (..., Nx).
     """
@@ -28,14 +28,16 @@ class Pooled(NamedTuple):
     hits: Tensor
 
 
-def _sum_up(parts: list[Tensor], cell: Tensor, shape: Sequence[int]) -> Pooled:
-    """Add up ten or eleven components (M,): vector, matrix, perhaps bearing, count."""
-    rows = torch.stack(parts)
-    total = torch.zeros(len(parts), math.prod(shape), dtype=rows.dtype, device=rows.device)
-    total = total.scatter_add(1, cell.expand(len(parts), -1), rows)
-    total = total.reshape(len(parts), *shape).movedim(0, -1)
-    bearing = total[..., 9] if len(parts) == 11 else torch.zeros_like(total[..., 9])
-    return Pooled(Information(total[..., :3], total[..., 3:9]), bearing, total[..., -1])
+def _sum_up(information: list[Tensor], others: list[Tensor], cell: Tensor, shape: Sequence[int]) -> Pooled:
+    """Add up the nine components (M,) of vectors and matrices, and two of bearings and counts, cell by cell."""
+    vector_matrix, rest = (
+        torch.zeros(len(parts), math.prod(shape), dtype=parts[0].dtype, device=cell.device)
+        .scatter_add(1, cell.expand(len(parts), -1), torch.stack(parts))
+        .reshape(len(parts), *shape)
+        .movedim(0, -1)
+        for parts in (information, others)
+    )
+    return Pooled(Information(vector_matrix[..., :3], vector_matrix[..., 3:9]), *rest.unbind(-1))
 
 
 def pool(gaussian: Gaussian, cell: Tensor, shape: Sequence[int]) -> Pooled:
@@ -49,8 +51,8 @@ def pool(gaussian: Gaussian, cell: Tensor, shape: Sequence[int]) -> Pooled:
     Differentiable in the Gaussians.
     """
     vector, matrix = information_from_gaussian(gaussian)
-    parts = [*vector.unbind(-1), *matrix.unbind(-1), torch.ones_like(vector[..., 0])]
-    return _sum_up(parts, cell, shape)
+    one = torch.ones_like(vector[..., 0])
+    return _sum_up([*vector.unbind(-1), *matrix.unbind(-1)], [torch.zeros_like(one), one], cell, shape)
 
 
 def pool_patches(
@@ -75,11 +77,12 @@ def pool_patches(
 
     Differentiable in all but the cells.
     """
-    x, y, z = row.unbind(-1)
+    # each adds to the information of one direction alone: rounded in float32 it would tell of the others too
+    x, y, z = row.double().unbind(-1)
     weight = keep / variance
     wx, wy, wz = weight * x, weight * y, weight * z
-    parts = [wx * rho, wy * rho, wz * rho, wx * x, wx * y, wx * z, wy * y, wy * z, wz * z, keep * bearing]
-    return _sum_up([*parts, keep], cell, shape)
+    parts = [wx * rho, wy * rho, wz * rho, wx * x, wx * y, wx * z, wy * y, wy * z, wz * z]
+    return _sum_up(parts, [keep * bearing, keep], cell, shape)
 
 
 def share_errors(pooled: Pooled, precision: Tensor, patches: Tensor, shared: float) -> tuple[Pooled, Tensor]:
@@ -177,4 +180,4 @@ def found_points(pooled: Pooled, cells: Tensor, chart: str, slope_std: float, fa
         safe = torch.where(seen[..., None], matrix, columns(one, zero, zero, one, zero, one))
         return torch.where(seen[..., None], times3(inverse3(safe), vector), cells)
     rho = torch.where(seen, nearness(pooled.information, slope_std**-2, torch.where(seen, zero, one))[0], one)
-    return cells / rho.clamp(min=1 / far_m)[..., None]
+    return cells / rho.to(cells.dtype).clamp(min=1 / far_m)[..., None]

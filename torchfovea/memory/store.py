@@ -97,9 +97,11 @@ def _check(parts: dict[str, Tensor], axis: Tensor | None, classes: Tensor | None
     good = good and (classes is None or (classes.shape[:-1] == shape and bool((classes > 0).all())))
     require(good, "shapes", [tuple(part.shape) for part in every], "those of one set of cells")
     kind = parts["cells"].dtype
-    good = kind in (torch.float32, torch.float64) and all(part.dtype == kind for part in every)
+    sums = [parts["vector"], parts["matrix"]]
+    good = kind in (torch.float32, torch.float64) and all(part.dtype == torch.float64 for part in sums)
+    good = good and all(part.dtype == kind for part in every if not any(part is one for one in sums))
     good = good and all(bool(torch.isfinite(part).all()) for part in every)
-    require(good, "values", "of several kinds or not finite", "finite numbers of one kind")
+    require(good, "values", "of several kinds or not finite", "finite numbers of one kind, sums in float64")
     counted = (parts[name] for name in ("bearing", "looks", "votes"))
     good = all(bool((part >= 0).all()) for part in counted) and bool(positive_definite(parts["matrix"], 0.0).all())
     require(good, "values", "negative counts or no covariance", "a memory's")

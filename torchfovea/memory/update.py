@@ -153,7 +153,7 @@ def _remember_patches(
 
 def _variance(pooled: Pooled, prior: Prior) -> Tensor:
     """Of the pooled inverse range (..., Nx) by itself; 1 where nothing came."""
-    return nearness(pooled.information, prior.slope_std**-2, (pooled.hits == 0).to(pooled.hits))[1]
+    return nearness(pooled.information, prior.slope_std**-2, (pooled.hits == 0).to(pooled.hits))[1].to(pooled.hits)
 
 
 def _add(pooled: Pooled, memory: Memory, common: Common | None) -> Pooled:

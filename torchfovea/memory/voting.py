@@ -173,7 +173,7 @@ def within_sight(memory: Memory, among: Tensor, eyes: Eyes, cameras: tuple[Camer
     with torch.no_grad():
         lead, which = among.shape[:-1], among.reshape(-1).nonzero().squeeze(1)
         vector, matrix, cells = (gather_columns(part, which) for part in (*memory.information, memory.cells))
-        rho = nearness(Information(vector, matrix))[0].clamp(min=1 / FAR_M)[:, None]
+        rho = nearness(Information(vector, matrix))[0].to(cells.dtype).clamp(min=1 / FAR_M)[:, None]
         inside = torch.ones_like(rho, dtype=torch.bool)
         poses = ((eyes.R_left, eyes.t_left), (eyes.R_right, eyes.t_right))
         for camera, (rotation, origin) in zip(cameras, poses, strict=True):

@@ -16,7 +16,7 @@ from torchfovea.commands.bench.timing import Growth, Path, Peer, nbytes, same
 from torchfovea.compiling import compiling
 from torchfovea.gaussian import Gaussian, columns, pack, unpack
 from torchfovea.memory.association import Pairs, associate, gather_columns
-from torchfovea.memory.egosphere import Prior, belief, empty_memory
+from torchfovea.memory.egosphere import Memory, Prior, belief, empty_memory
 from torchfovea.memory.nearest import nearest_cell
 from torchfovea.memory.pooling import pool, pool_patches
 from torchfovea.memory.update import fuse
@@ -151,14 +151,14 @@ def _fuse(look: Saccade) -> list[Path]:
         gaussian.mean.contiguous(),
         empty_memory(cells, Prior(), "cartesian"),
     )
-    vector, matrix = memory.information.vector.contiguous(), unpack(memory.information.matrix).contiguous()
+    vector, matrix = _blocks(memory)
 
     def points() -> Gaussian:
         return belief(fuse(memory, pool(gaussian, pairs.cell, shape)))
 
     patches = empty_memory(cells, prior)
     rows = row.contiguous()
-    first, second = patches.information.vector.contiguous(), unpack(patches.information.matrix).contiguous()
+    first, second = _blocks(patches)
 
     def planes() -> Gaussian:
         return belief(fuse(patches, pool_patches(rho, spread, bearing, row, keep, pairs.cell, shape)))
@@ -194,6 +194,12 @@ def _fuse(look: Saccade) -> list[Path]:
             ("patches", planes, others[1], inputs[1], ()),
         )
     ]  # fmt: skip
+
+
+def _blocks(memory: Memory) -> tuple[Tensor, Tensor]:
+    """A memory's information in the cells' dtype, as peers keep it: (..., 3) and (..., 3, 3)."""
+    vector, matrix = (part.to(memory.cells.dtype) for part in memory.information)
+    return vector.contiguous(), unpack(matrix).contiguous()
 
 
 def _shaped(direction: Tensor, rho: Tensor, variance: Tensor) -> Tensor:

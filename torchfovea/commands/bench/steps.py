@@ -34,8 +34,9 @@ __all__ = ["batched_steps", "paths_of_steps"]
 
 
 def _known(memory: Memory) -> tuple[Any, ...]:
-    """Cells, information and counts in NumPy, the matrices whole."""
-    parts = (memory.cells, memory.information.vector, unpack(memory.information.matrix), memory.bearing)
+    """Cells, information and counts in NumPy, in the cells' dtype, the matrices whole."""
+    vector, matrix = (part.to(memory.cells.dtype) for part in memory.information)
+    parts = (memory.cells, vector, unpack(matrix), memory.bearing)
     return (*(part.cpu().contiguous().numpy() for part in parts), (memory.looks > 0).cpu().numpy())
 
 
