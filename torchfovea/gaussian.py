@@ -75,8 +75,8 @@ def unpack(sym: Tensor) -> Tensor:
 def inverse3(sym: Tensor) -> Tensor:
     """Inverse of packed symmetric positive definite matrices, (..., 6) to (..., 6), by their factors L D Lᵀ.
 
-    Good to the rounding times the ratio of the eigenvalues, whatever the units of the axes; cofactors, whose determinant
-    multiplies the small eigenvalues, lose twice the digits.
+    Good to the rounding times the ratio of the eigenvalues, whatever the units of the axes. Cofactors lose twice the
+    digits: their determinant multiplies the small eigenvalues.
     """
     xx, xy, xz, yy, yz, zz = sym.unbind(-1)
     one = 1 / xx
