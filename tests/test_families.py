@@ -7,6 +7,7 @@ from hydra import compose, initialize_config_dir
 from torchfovea.cli import main
 from torchfovea.commands.shared.build import build_observer, build_scene_of
 from torchfovea.commands.shared.config import conf_dir
+from torchfovea.commands.shared.rollout import roll_out
 from torchfovea.commands.tune.command import build_problem
 from torchfovea.perception import Eligibility, Observer, decide, new_memory
 from torchfovea.sensing.head import Head
@@ -78,3 +79,12 @@ def test_a_family_has_a_distribution_to_tune_on(name):
     low, high = problem.distribution.target_range_m
     assert ((scenes.nearest_m > low - 0.1) & (scenes.nearest_m < high)).all()
     assert scenes.x.shape == (8, problem.distribution.cans)
+
+
+def test_the_oracle_does_not_look_past_a_rim():
+    """Cans whose nearest point lies on the rim, where the cells beside it believe the wall behind."""
+    with initialize_config_dir(conf_dir(), version_base="1.3"):
+        small = ["profile=reduced", "sensor.sample=4000", "acquisition=oracle", "memory=aimed", "saccades=3"]
+        cfg = compose("search", overrides=["family=marked", *small])
+    episodes = roll_out(cfg, build_observer(cfg), [15, 31])
+    assert all(bool(episode.hit.any()) and float(episode.gap[-1]) > 0.99 for episode in episodes)

@@ -18,6 +18,7 @@ from torchfovea.commands.shared.strategy import build_stop, build_strategy
 from torchfovea.deciding.strategies import Strategy
 from torchfovea.episode import Each, Episode, Rules, run_episode, run_episodes
 from torchfovea.memory.egosphere import Memory
+from torchfovea.metrics import near_target
 from torchfovea.perception import Observer, new_memory
 from torchfovea.rows import stack
 from torchfovea.sensing.head import Head
@@ -80,7 +81,9 @@ def one_episode(
     if memory is None:
         memory = new_memory(observer, build_cells(_aimed(cfg, arena.world.scene), observer.head, generator))
     truth = arena.truth(memory.cells)
-    rules = _rules(cfg, build_strategy(cfg, observer, _aim(truth)) if strategy is None else strategy)
+    if strategy is None:
+        strategy = build_strategy(cfg, observer, _aim(truth, number(cfg, "near_target_m")))
+    rules = _rules(cfg, strategy)
     return run_episode(observer, memory, arena, truth, generator, rules, each)
 
 
@@ -89,8 +92,14 @@ def _rules(cfg: DictConfig, strategy: Strategy) -> Rules:
     return Rules(whole(cfg, "saccades"), strategy, build_stop(cfg), far_m, near_target_m)
 
 
-def _aim(truth: Truth) -> Tensor:
-    return torch.nn.functional.normalize(truth.nearest_point, dim=-1)
+def _aim(truth: Truth, near_m: float) -> Tensor:
+    """Where the oracle looks (3,): the middle of what cells see near the nearest point; itself, if none does.
+
+    The nearest point of a can above or below E lies on its rim, and a cell there may see, or believe, what is behind.
+    """
+    near = near_target(truth.cell_points, truth.nearest_point, near_m)
+    point = truth.cell_points[near].mean(0) if bool(near.any()) else truth.nearest_point
+    return torch.nn.functional.normalize(point, dim=-1)
 
 
 def _aimed(cfg: DictConfig, scene: Scene) -> DictConfig:
@@ -160,7 +169,7 @@ def roll_out(
     device = device_of(cfg) if "device" in cfg else "cpu"
     memory = _to(stack(memories), device)
     if strategy is None:
-        aims = stack([_aim(truth) for truth in truths]).to(device)
+        aims = stack([_aim(truth, number(cfg, "near_target_m")) for truth in truths]).to(device)
         chosen = build_strategy(cfg, observer, aims)
     else:
         chosen = strategy(truths)
