@@ -12,10 +12,11 @@ from torch import Tensor
 
 from torchfovea.deciding.strategies import Strategy, View
 from torchfovea.envs.actions import ACQUISITIONS, command, weighed
-from torchfovea.envs.observations import map_index, memory_map
+from torchfovea.envs.observations import Shown, map_index, memory_map
 from torchfovea.envs.settings import ACTIONS
 from torchfovea.imported import load_function
-from torchfovea.memory.egosphere import cartesian_belief
+from torchfovea.memory.egosphere import cartesian_belief, trust
+from torchfovea.metrics import information
 from torchfovea.perception import Observer
 from torchfovea.sensing.head import fixate
 from torchfovea.setting import SettingError, require
@@ -49,7 +50,9 @@ def policy_strategy(
         require(memory is not None, "view.memory", None, "what is known, as torchfovea.perception.decide shows it")
         assert memory is not None
         index = map_index(view.directions, observer.head, map_shape) if view.state is None else view.state
-        known = memory_map(memory, view.eligible, index, map_shape)
+        points = cartesian_belief(memory)
+        shown = Shown(points.mean, information(points.cov), trust(memory), view.eligible)
+        known = memory_map(shown, index, map_shape)
         lead = view.mean.shape[:-1]
         seen = {"memory": known.reshape(-1, *known.shape[-3:]), "gaze": view.line_of_sight.reshape(-1, 3).float()}
         given = policy({name: value.detach().cpu().numpy() for name, value in seen.items()})
@@ -63,7 +66,7 @@ def policy_strategy(
             if action == "weights":
                 score = weighed(view, answer[..., :size].to(view.mean))
             else:
-                aim = fixate(observer.head, cartesian_belief(memory).mean)[0]
+                aim = fixate(observer.head, points.mean)[0]
                 pan, tilt = command(observer.head, answer.to(view.mean).clamp(-1, 1))
                 score = -((aim.pan - pan[..., None]).square() + (aim.tilt - tilt[..., None]).square())
         return torch.where(named[..., None], view.mean, score), index

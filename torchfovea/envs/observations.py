@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -12,8 +12,7 @@ from torch import Tensor
 
 from torchfovea.envs.rows import SearchRows
 from torchfovea.envs.settings import EnvSettings
-from torchfovea.memory.egosphere import Memory, cartesian_belief, trust
-from torchfovea.metrics import information
+from torchfovea.memory.egosphere import trust
 from torchfovea.perception import Observer
 from torchfovea.rows import row
 from torchfovea.search import Look
@@ -23,12 +22,34 @@ from torchfovea.sensing.retina import fovea
 from torchfovea.sensing.triangulation import observe
 from torchfovea.setting import require
 
-__all__ = ["CHANNELS", "map_index", "memory_map", "observation_space", "observations"]
+__all__ = ["CHANNELS", "Shown", "map_index", "memory_map", "observation_space", "observations", "shown_of"]
 
 # the map's channels: inverse range [1/m], information −log|Σ| [nats / 10], inlier probability, whether it is eligible
 CHANNELS = ("inverse_range", "information", "inlier", "eligible")
 _LOW, _HIGH = (0.0, -10.0, 0.0, 0.0), (10.0, 10.0, 1.0, 1.0)
 _MOST = 1e3  # of a Gaussian's numbers
+
+
+class Shown(NamedTuple):
+    """What a map shows of cells.
+
+    Attributes:
+        mean: of their points (..., Nx, 3) [m].
+        nats: information of those, −log|Σ|, (..., Nx).
+        sure: inlier probability (..., Nx).
+        eligible: which may be fixated, bool (..., Nx).
+    """
+
+    mean: Tensor
+    nats: Tensor
+    sure: Tensor
+    eligible: Tensor
+
+
+def shown_of(rows: SearchRows, some: list[int]) -> Shown:
+    """What is known in some rows."""
+    known = Shown(rows.step.points.mean, rows.nats, trust(rows.memory), rows.step.eligible)
+    return known if some == list(range(rows.count)) else Shown(*(part[some] for part in known))
 
 
 def observation_space(settings: EnvSettings, observer: Observer, fields: int) -> spaces.Dict:
@@ -78,23 +99,22 @@ def map_index(cells: Tensor, head: Head, shape: tuple[int, int]) -> Tensor:
     return (cells @ place.mT).argmax(-2)
 
 
-def memory_map(memory: Memory, eligible: Tensor, index: Tensor, shape: tuple[int, int]) -> Tensor:
+def memory_map(known: Shown, index: Tensor, shape: tuple[int, int]) -> Tensor:
     """The map (..., 4, rows, columns) of what is known, float32; see `CHANNELS` and `observation_space`.
 
     Args:
-        memory: (..., Nx).
-        eligible: bool (..., Nx).
+        known: of the cells.
         index: of the cells, see `map_index`.
         shape: rows and columns.
     """
-    points = cartesian_belief(memory)
-    inverse = 1 / points.mean.norm(dim=-1).clamp(min=1e-3)
-    nats = information(points.cov) / 10
-    values = torch.stack([inverse, nats, trust(memory), eligible.to(inverse)], -2).float()
+    at = index.expand(*known.sure.shape[:-1], index.shape[-1])
+    x, y, z, nats, sure, eligible = (
+        part.gather(-1, at).float() for part in (*known.mean.unbind(-1), known.nats, known.sure, known.eligible)
+    )
+    inverse = (x * x + y * y + z * z).clamp(min=1e-6).rsqrt()
+    values = torch.stack([inverse, nats / 10, sure, eligible], -2)
     low, high = (torch.tensor(v, device=values.device)[:, None] for v in (_LOW, _HIGH))
-    values = torch.minimum(torch.maximum(values, low), high)
-    index = index[..., None, :].expand(*values.shape[:-1], index.shape[-1])
-    found: Tensor = values.gather(-1, index).unflatten(-1, shape)
+    found: Tensor = torch.minimum(torch.maximum(values, low), high).unflatten(-1, shape)
     return found
 
 
@@ -103,7 +123,7 @@ def observations(rows: SearchRows, some: list[int], index: Tensor) -> dict[str, 
     settings, found = rows.settings, {}
     for name in settings.observe:
         if name == "memory":
-            found[name] = memory_map(rows.memory, rows.step.eligible, index, settings.map_shape)[some].cpu().numpy()
+            found[name] = memory_map(shown_of(rows, some), index, settings.map_shape).cpu().numpy()
         elif name == "gaze":
             sight = cyclopean(rows.observer.head, Gaze(*(angle[some] for angle in rows.gaze)))[0][..., 2]
             found[name] = sight.float().clamp(-1, 1).cpu().numpy()

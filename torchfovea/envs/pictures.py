@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfovea.envs.observations import memory_map
+from torchfovea.envs.observations import memory_map, shown_of
 from torchfovea.envs.rows import SearchRows
 from torchfovea.sensing.head import Gaze, cyclopean
 
@@ -24,7 +24,7 @@ def draw_rows(rows: SearchRows, some: list[int], index: Tensor) -> list[np.ndarr
     What is not eligible is darker; the cross is the line of sight.
     """
     shape = rows.settings.map_shape
-    maps = memory_map(rows.memory, rows.step.eligible, index, shape)[some].cpu()
+    maps = memory_map(shown_of(rows, some), index, shape).cpu()
     sight = cyclopean(rows.observer.head, Gaze(*(angle[some] for angle in rows.gaze)))[0][..., 2]
     place = (rows.cells[index] @ sight.mT).argmax(0).tolist()
     pictures = []

@@ -32,8 +32,8 @@ Generators = Sequence[torch.Generator]
 class SearchPlaces(Protocol):
     """B places, of which some rows (K,) are asked at a time."""
 
-    def renew(self, row: int, scene: int, seed: int) -> None:
-        """Put a row into the scene of a seed; `seed` is that of its encoders' noise."""
+    def renew(self, rows: Sequence[int], scenes: Sequence[int], seeds: Sequence[int]) -> None:
+        """Put rows into the scenes of some seeds; `seeds` are those of their encoders' noise."""
         ...
 
     def truth(self, row: int) -> Truth | None:
@@ -89,10 +89,11 @@ class GeometricPlaces:
         motor, device = build_motor(cfg)(scene), cells.device
         self.arenas = GeometricArenas([scene] * count, observer, sample_of(cfg), device, motor)
 
-    def renew(self, row: int, scene: int, seed: int) -> None:
+    def renew(self, rows: Sequence[int], scenes: Sequence[int], seeds: Sequence[int]) -> None:
         """See `SearchPlaces`."""
-        self.stands[row] = scene
-        self.arenas.renew([row], [self.scenes(scene)[0]], [seed])
+        for row, scene in zip(rows, scenes, strict=True):
+            self.stands[row] = scene
+        self.arenas.renew(rows, [self.scenes(scene)[0] for scene in scenes], seeds)
 
     def truth(self, row: int) -> Truth:
         """See `SearchPlaces`."""
@@ -130,10 +131,11 @@ class CellPlaces(GeometricPlaces):
         own: Tensor = self.truth(row).cell_points.norm(dim=-1)
         return own.to(self.scenes.cells.dtype).clamp(max=1e3).to(self.arenas.kind.device)
 
-    def renew(self, row: int, scene: int, seed: int) -> None:
+    def renew(self, rows: Sequence[int], scenes: Sequence[int], seeds: Sequence[int]) -> None:
         """See `SearchPlaces`."""
-        super().renew(row, scene, seed)
-        self.range_m[row] = self._ranges(row)
+        super().renew(rows, scenes, seeds)
+        for row in rows:
+            self.range_m[row] = self._ranges(row)
 
     def sense(
         self, rows: Sequence[int], memory: Memory, gaze: Gaze, generators: Generators
@@ -173,12 +175,13 @@ class RobotPlaces:
     def _truths(self) -> dict[int, Truth | None]:
         return {}
 
-    def renew(self, row: int, scene: int, seed: int) -> None:
+    def renew(self, rows: Sequence[int], scenes: Sequence[int], seeds: Sequence[int]) -> None:
         """A robot may have a `reset(seed)` of its own."""
-        reset = getattr(self.robots[row], "reset", None)
-        if callable(reset):
-            reset(seed)
-        self._truths.pop(row, None)
+        for row, seed in zip(rows, seeds, strict=True):
+            reset = getattr(self.robots[row], "reset", None)
+            if callable(reset):
+                reset(seed)
+            self._truths.pop(row, None)
 
     def truth(self, row: int) -> Truth | None:
         """See `SearchPlaces`."""
@@ -226,9 +229,10 @@ class PhotometricPlaces(RobotPlaces):
         self.cfg = cfg
         super().__init__([build_arena(cfg, observer, first)] * count, observer, cells)
 
-    def renew(self, row: int, scene: int, seed: int) -> None:
+    def renew(self, rows: Sequence[int], scenes: Sequence[int], seeds: Sequence[int]) -> None:
         """See `SearchPlaces`."""
-        arena = build_arena(self.cfg, self.observer, scene)
-        arena.noise.manual_seed(seed)
-        self.robots[row] = arena
-        self._truths.pop(row, None)
+        for row, scene, seed in zip(rows, scenes, seeds, strict=True):
+            arena = build_arena(self.cfg, self.observer, scene)
+            arena.noise.manual_seed(seed)
+            self.robots[row] = arena
+            self._truths.pop(row, None)

@@ -21,7 +21,7 @@ from torchfovea.gaussian import Information
 from torchfovea.memory.cell_index import CellIndex
 from torchfovea.memory.egosphere import Memory, trust
 from torchfovea.memory.nearest import join_indices
-from torchfovea.metrics import gap, information, local_information, near_target
+from torchfovea.metrics import gap, information, near_target
 from torchfovea.perception import Step, decide, gaze_at, new_memory
 from torchfovea.search import Look, Robot
 from torchfovea.sensing.head import Gaze, fixate
@@ -65,6 +65,8 @@ class SearchRows:
         observer: the fixed parts.
         cells: unit directions (Nx, 3).
         step: of all rows, what is known: the last decision's beliefs.
+        nats: of all rows, each cell's information −log|Σ| (B, Nx).
+        near: of all rows, which cells' true points are near the nearest one (B, Nx); none where nobody judges.
         gaze: of all rows, where the heads are.
         looks: of each row the last look, which row of that look is its own, and the gaze; no look in fidelity `cells`.
     """
@@ -106,8 +108,10 @@ class SearchRows:
         self.hit = torch.zeros(count, settings.saccades, dtype=torch.bool)
         self.travelled, self.seconds = torch.zeros(2, count, dtype=torch.float64)
         self.judged = torch.zeros(count, dtype=torch.bool)
+        self.near = torch.zeros(count, len(self.cells), dtype=torch.bool, device=self.device)
         self.looks: list[tuple[Look | None, int, Gaze]] = [(None, 0, self.gaze)] * count
         self.step: Step = decide(self.observer, self.memory, strategy=_mean)
+        self.nats = information(self.step.points.cov)
 
     def begin(self, rows: Sequence[int], seeds: Sequence[int]) -> None:
         """Begin an episode in some rows: another scene, an empty memory, and a look straight ahead.
@@ -116,15 +120,19 @@ class SearchRows:
             rows: their numbers.
             seeds: one for each; the same seed gives the same scene and the same noise.
         """
-        for row, seed in zip(rows, seeds, strict=True):
+        some, scenes, chosen, noises = list(rows), self.settings.scenes, [], []
+        for row, seed in zip(some, seeds, strict=True):
             generator = self.generators[row].manual_seed(seed)
-            scenes = self.settings.scenes
-            chosen = scenes[int(torch.randint(len(scenes), (), generator=generator))]
-            self.places.renew(row, chosen, int(torch.randint(2**62, (), generator=generator)))
+            chosen.append(scenes[int(torch.randint(len(scenes), (), generator=generator))])
+            noises.append(int(torch.randint(2**62, (), generator=generator)))
+        self.places.renew(some, chosen, noises)
+        for row in some:
             truth = self.places.truth(row)
             self.judged[row] = truth is not None
             self.nearest[row] = torch.nan if truth is None else truth.nearest_m
-        some = list(rows)
+            if truth is not None:
+                near = near_target(truth.cell_points, truth.nearest_point, self.near_target_m)
+                self.near[row] = near.to(self.device)
         for field in (self.course, self.known, self.locally):
             field[some] = torch.nan
         self.time[some], self.hit[some], self.travelled[some], self.seconds[some] = 0, False, 0.0, 0.0
@@ -180,15 +188,13 @@ class SearchRows:
         self.memory = memory if whole else _put(self.memory, rows, memory)
         self.step = step._replace(memory=self.memory) if whole else _put(self.step, rows, step)
         nats = information(step.points.cov)
+        self.nats = nats if whole else _put(self.nats, rows, nats)
         self.known[rows, self.time[rows]] = nats.mean(-1).double().cpu()
-        if bool(self.judged[rows].all()):
-            self.locally[rows, self.time[rows]] = self._local(rows, step).double().cpu()
-
-    def _local(self, rows: list[int], step: Step) -> Tensor:
-        truths = [self.places.truth(row) for row in rows]
-        near = torch.stack([near_target(t.cell_points, t.nearest_point, self.near_target_m) for t in truths if t])
-        nats, there = local_information(step.points.cov, near.to(self.device))
-        return torch.where(there, nats, torch.nan)
+        near = self.near[rows]
+        count = near.sum(-1)
+        local = torch.where(near, nats, 0.0).sum(-1) / count
+        judged = self.judged[rows].to(self.device) & (count > 0)
+        self.locally[rows, self.time[rows]] = torch.where(judged, local, torch.nan).double().cpu()
 
     def _turn(self, rows: list[int], gaze: Gaze) -> Gaze:
         """Turn, and judge where the heads then look."""

@@ -93,6 +93,8 @@ class GeometricArenas:
 
     def some(self, rows: Sequence[int]) -> GeometricArenas:
         """The arenas of some rows by themselves; heads that are moved there are ours."""
+        if list(rows) == list(range(len(self.noise))):
+            return self
         part, index = copy(self), torch.tensor(rows)
         part.solids, part.kind = take(self.solids, index.to(self.device)), self.kind[index.to(self.device)]
         part.stands, part.noise, part._whole = self.stands[index], [self.noise[row] for row in rows], (self, index)
@@ -107,10 +109,8 @@ class GeometricArenas:
         last = Gaze(*self.before.unbind(-1))
         a, b = (cyclopean(head, g)[0][..., 2] for g in (last, command))
         degrees = torch.rad2deg(torch.atan2(torch.linalg.cross(a, b).square().sum(-1).sqrt(), (a * b).sum(-1)))
-        seconds = [
-            self.motor.duration_s(Gaze(*then), Gaze(*now))
-            for then, now in zip(zip(*last, strict=True), zip(*command, strict=True), strict=True)
-        ]
+        thens, nows = (zip(*(angle.tolist() for angle in g), strict=True) for g in (last, command))
+        seconds = [self.motor.duration_s(Gaze(*then), Gaze(*now)) for then, now in zip(thens, nows, strict=True)]
         self.before = torch.stack(command, -1)
         if self._whole is not None:
             whole, rows = self._whole

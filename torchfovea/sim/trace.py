@@ -281,11 +281,11 @@ def ranges(solids: Solids, origin_e: Tensor, directions_e: Tensor) -> Tensor:
 
 def _ranges(solids: Solids, origin_e: Tensor, directions_e: Tensor) -> tuple[Tensor, list[Tensor], _Rays, list[_Pairs]]:
     """Ranges (B, N), where each pair of faces is left, and what led there."""
-    length = torch.linalg.vector_norm(directions_e.to(solids.rotation), dim=-1)
+    directions_e = directions_e.to(solids.rotation)
+    length = (directions_e * directions_e).sum(-1).sqrt()  # vector_norm takes forty times as long over strided axes
     whole = bool(((length > 0) & (length < torch.inf)).all())
     require(whole, "directions_e", "zero or not finite", "directions")
-    directions_e = directions_e.to(solids.rotation) / length[..., None]
-    rays = _world(solids, origin_e, directions_e)
+    rays = _world(solids, origin_e, directions_e / length[..., None])
     offset = [middle - o for middle, o in zip(solids.middle, rays.origin, strict=True)]
     inside = bool(torch.stack([h - o.abs() for h, o in zip(solids.half, offset, strict=True)]).amin() > 0)
     require(inside, "origin", "an eye outside of the room", "eyes inside")
