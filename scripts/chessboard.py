@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import torch
 
-from torchfovea.commands.sense.command import sense
+from torchfovea.commands.sense.points import sense
 from torchfovea.commands.shared.budgets import load_budget
 from torchfovea.sensing.layout import LogPolar
 from torchfovea.stereo.calibration_files import load_calibration

@@ -16,7 +16,7 @@ import torch
 from scipy.stats import t as student
 
 from torchfovea.commands.sense.checks import examine
-from torchfovea.commands.sense.command import sense
+from torchfovea.commands.sense.points import sense
 from torchfovea.commands.sense.report import match_figures
 from torchfovea.commands.shared.budgets import load_budget
 from torchfovea.commands.shared.pairs import Pair, load_folder

@@ -10,7 +10,7 @@ import torch
 from test_views import turned
 
 from torchfovea.cli import main
-from torchfovea.commands.sense.command import sense
+from torchfovea.commands.sense.points import sense
 from torchfovea.sensing.camera import Pinhole
 from torchfovea.sensing.correspondence import Budget
 from torchfovea.sensing.head import Head

@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
 
+from torchfovea.commands.search.figure1 import draw_figure1, sensors_of
 from torchfovea.commands.search.remembering import (
     Best,
     best_fixation,
@@ -47,6 +48,7 @@ from torchfovea.metrics import phantom
 from torchfovea.perception import Observer
 from torchfovea.rows import row
 from torchfovea.search import Glance
+from torchfovea.sensing.head import Gaze
 from torchfovea.setting import require
 
 __all__ = ["SACCADE_COLUMNS", "run", "saccade_rows", "summarize"]
@@ -76,7 +78,7 @@ def run(cfg: DictConfig) -> float:
     # mistakes come first, also in what is not used
     build_strategy(cfg, observer), build_match(cfg, observer), build_motor(cfg), build_route(cfg), build_noise(cfg)
     loaded_memory(cfg, observer), check_resample(cfg, observer)
-    saved = memory_path(cfg, "memory.save")
+    saved, both = memory_path(cfg, "memory.save"), sensors_of(cfg, observer)
     done = finished(cfg, folder)
     if done is not None:
         return done
@@ -101,6 +103,9 @@ def run(cfg: DictConfig) -> float:
     assert last is not None
     if cfg.picture:
         _draw(folder, cfg, observer.retina, last, rows[-1])
+    if both:
+        gaze = Gaze(*(angle[-1] for angle in last.gaze))
+        draw_figure1(folder / "figure1.png", both, seed + episodes - 1, gaze)
     if saved is not None:
         save_memory(saved, last.step.memory)
     summary = summarize(rows)

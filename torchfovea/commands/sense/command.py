@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
-from torch import Tensor
 
 from torchfovea.cloud import COVARIANCE, write_ply
 from torchfovea.commands.sense.checks import examine, examine_map, health_of
+from torchfovea.commands.sense.figure1 import draw_figure1, retinas_of
+from torchfovea.commands.sense.points import Sensed, look
 from torchfovea.commands.sense.report import beside, image_seen, match_figures, read_at_fields
 from torchfovea.commands.shared.budgets import build_budget
 from torchfovea.commands.shared.build import build_match, build_sensor, choice, name_of
@@ -21,48 +22,23 @@ from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.pairs import Pair, gaze_of, load_pair
 from torchfovea.commands.shared.unread import refuse_unread
 from torchfovea.files import replacing, write_result
-from torchfovea.gaussian import Gaussian, columns
-from torchfovea.sensing.chart import cartesian_from_inverse_range
-from torchfovea.sensing.correspondence import Budget, Correspondences, Disparity
-from torchfovea.sensing.head import Eyes
-from torchfovea.sensing.kinship import once_a_pixel
+from torchfovea.sensing.correspondence import Budget, Disparity
 from torchfovea.sensing.layout import Retina
-from torchfovea.sensing.triangulation import Observations, observe
-from torchfovea.sensing.unscented import SigmaPoints
 from torchfovea.setting import SettingError, require
 from torchfovea.stereo.external import External
 from torchfovea.stereo.health import misaligned
-from torchfovea.stereo.matchers import Match, Matcher, checked_matches
+from torchfovea.stereo.matchers import Match, Matcher
 from torchfovea.stereo.matching import match_sgbm
 from torchfovea.stereo.meeting import met
 from torchfovea.stereo.sgbm import SGBM
 from torchfovea.stereo.views import Views
-from torchfovea.studies.calibration import mixture_std
 
-__all__ = ["Sensed", "run", "sense"]
+__all__ = ["run"]
 
 FRAME = "the left camera's frame: x right, y down, z forward"
 PLAIN_BYTES = 1_000_000_000
 _MET = "the right retina looks at [{:.0f}, {:.0f}], at the left one's thing (gaze_right_px=same: at the same pixel)"
 UNITS = "mean_m m, cov_m2 m^2, left_px retinal px, left_image_px px, inverse_range 1/m; direction has length 1"
-
-
-class Sensed(NamedTuple):
-    """Points of a pair, in the left camera's optical frame (x right, y down, z forward).
-
-    Attributes:
-        matches: the correspondences.
-        observed: in the inverse-range chart about the left camera.
-        points: Cartesian moments, (N, 3) [m] and (N, 6) [m²].
-        colour: what each receptive field sees, (N, 3).
-        chosen: bool (N,), the valid fields of which none copies another's source pixel.
-    """
-
-    matches: Correspondences
-    observed: Observations
-    points: Gaussian
-    colour: Tensor
-    chosen: Tensor
 
 
 def run(cfg: DictConfig) -> float | None:
@@ -76,6 +52,7 @@ def run(cfg: DictConfig) -> float | None:
     views, free = _looking(cfg, pair)
     budget, whole = build_budget(cfg, pair=True), choice(cfg, "span", ("whole", "shorter")) == "whole"
     printed = choice(cfg, "budget.sigma_points", ("ours", "paper")) == "paper"
+    both = retinas_of(cfg, retina, budget)
     found_out = examine(pair, views, health)
     pair, told = pair._replace(disparity=found_out.disparity), found_out.warnings
     if free:
@@ -84,19 +61,18 @@ def run(cfg: DictConfig) -> float | None:
     views = views.whole() if whole else views
     budget, folder = misaligned(budget, found_out.rows_px), run_folder()
 
-    matches, found = _matched(match, views, retina, budget)
+    sensed, found = look(match, views, printed, retina, budget)
     foreign = isinstance(match, Matcher) and isinstance(match.params, External) and views.rectified
     if foreign and isinstance(found, Disparity) and found_out.matches is not None:
         told += examine_map(found.disparity, found.valid, found_out.matches, views, health)
-    sensed = sense(views, retina, matches, SigmaPoints.paper() if printed else None, not printed)
     _write(folder, sensed, views, retina)
-    right_px = views.gazes_px[1]
+    right_px, looked = views.gazes_px[1], views
     # the truth is the left image's, wherever the right eye looked
     views = views._replace(rectified=pair.rig is None, gaze_right_px=None)
     # from here on nothing can lose the points
     observed, points = sensed.observed, sensed.points
     figures: dict[str, float] = {"image_seen": image_seen(views, retina), "rows_px": found_out.rows_px}
-    figures |= match_figures(pair, views, retina, matches.left_px, observed, points, sensed.chosen)
+    figures |= match_figures(pair, views, retina, sensed.matches.left_px, observed, points, sensed.chosen)
     if pair.disparity is not None and retina is not None:
         try:
             figures |= _beside_plain(match, pair, views, retina, budget, sensed)
@@ -104,7 +80,10 @@ def run(cfg: DictConfig) -> float | None:
             told.append(f"not judged beside plain matching: {error}")
     from torchfovea.commands.sense.pictures import draw_sense
 
-    draw_sense(folder / "sense.png", pair.left, found, retina, observed, matches.left_px)
+    draw_sense(folder / "sense.png", pair.left, found, retina, observed, sensed.matches.left_px)
+    if both:
+        alike = partial(look, match, looked, printed)
+        draw_figure1(folder / "figure1.png", pair, both, lambda r, b: alike(r, misaligned(b, found_out.rows_px))[0])
     write_result(folder, {**figures, "gaze_right_px": right_px, "warnings": told})
     grid = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     for name, value in figures.items():
@@ -144,46 +123,6 @@ def _beside_plain(
     _, plain = match_sgbm(views, None, params, budget, ours.nearest_m, most_bytes=PLAIN_BYTES)
     again = read_at_fields(plain.disparity, views, retina, plain.valid)
     return beside(pair, views, retina, sensed.observed, sensed.points, again)
-
-
-def _matched(match: Match, views: Views, retina: Retina | None, budget: Budget) -> tuple[Correspondences, Any]:
-    """Match, with a user's own matcher too."""
-    if retina is None:
-        require(isinstance(match, Matcher), "sensor.layout", "every_pixel", "a retina, for a matcher of your own")
-        assert isinstance(match, Matcher)
-        return match(views, None, budget)
-    return checked_matches(match(views, retina, budget), retina)
-
-
-def sense(
-    views: Views, retina: Retina | None, matches: Correspondences, points: SigmaPoints | None, rotated: bool
-) -> Sensed:
-    """Correspondences of a pair as points with covariances, in the left camera's frame."""
-    rotation, across = views.rig.R_left.mT, views.rig.R_left.new_tensor([views.rig.baseline_m, 0.0, 0.0])
-    eye, right = torch.eye(3), ((rotation @ views.rig.R_right).float(), (rotation @ across).float())
-    rig = Eyes(eye, torch.zeros(3), *right)
-    px, cameras = matches.left_px, views.cameras(retina)
-    support = torch.full_like(px[..., 0], 0.5) if retina is None else retina.width_px(px) / 2
-    observed = _doubted(observe(matches, rig, cameras, support, points, "inverse_range", rotated))
-    moments = cartesian_from_inverse_range(Gaussian(observed.mean, observed.cov), observed.direction)
-    if retina is None:
-        colour, chosen = views.left.flatten(1).T, observed.valid
-    else:
-        colour = views.fovea(views.left[None], retina)[0].T
-        chosen = once_a_pixel(px, 1 / views.scale(retina), observed.valid)
-    return Sensed(matches, observed, moments, colour, chosen)
-
-
-def _doubted(observed: Observations) -> Observations:
-    """Observations whose inverse ranges are as uncertain as they are, a doubtful match taken in (`mixture_std`)."""
-    rho, valid = observed.mean[:, 2], observed.valid
-    if observed.inlier is None or int(valid.sum()) < 2:
-        return observed
-    *rest, variance = observed.cov.unbind(-1)
-    sigma = variance.sqrt()
-    factor = torch.where(valid, mixture_std(sigma, observed.inlier, rho[valid].std()) / sigma, 1.0)
-    aa, ab, ar, bb, br = rest
-    return observed._replace(cov=columns(aa, ab, factor * ar, bb, factor * br, factor.square() * variance))
 
 
 def _write(folder: Path, sensed: Sensed, views: Views, retina: Retina | None) -> None:

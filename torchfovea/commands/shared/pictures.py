@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import matplotlib
@@ -10,6 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchfovea.commands.shared.precision import Cloud, PlotFrame
+from torchfovea.files import write_figure
 from torchfovea.metrics import information
 from torchfovea.search import Glance
 from torchfovea.sensing.correspondence import Disparity
@@ -20,8 +23,12 @@ from torchfovea.stereo.sweep import SweepRange
 matplotlib.use("Agg")
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-__all__ = ["azimuth_elevation", "draw_glance", "found_map", "sphere_map"]
+__all__ = ["azimuth_elevation", "draw_glance", "draw_precision", "found_map", "sphere_map"]
+
+VIEW = {"elev": 16.0, "azim": -68.0}  # from behind the eyes, above and to the right of them
+MOST = 40_000  # points of a cloud that are drawn
 
 
 def found_map(found: Disparity | SweepRange, retina: Retina | None, size_px: int) -> tuple[np.ndarray, str]:
@@ -106,3 +113,57 @@ def draw_glance(glance: Glance, path: Tensor, nats: Sequence[float], retina: Ret
     wide[2].set(xlabel="fixation", ylabel="mean information [nats]")
     wide[2].grid(alpha=0.3)
     return figure
+
+
+def draw_precision(path: Path, true: Cloud, measured: Sequence[Cloud], frame: PlotFrame) -> None:
+    """Draw the paper's Fig. 1: a scene, and what each retina knows of it; in space, and as the left eye sees it.
+
+    Args:
+        path: the PNG to write.
+        true: in the picture's colours; all are cut to where these points lie.
+        measured: coloured by information, on one scale.
+        frame: of all points.
+    """
+    edges = torch.stack([true.seen_deg.amin(0), true.seen_deg.amax(0)]).double()
+    tall = float(((edges[1] - edges[0]) / (edges[1] - edges[0]).roll(1))[1].nan_to_num(1.0).clamp(0.4, 1.4))
+    engine = ConstrainedLayoutEngine(rect=(0, 0, 0.975, 1))  # what axes in space are called stands out of them
+    figure = Figure(figsize=(15, 5.2 + 4.6 * tall), layout=engine)
+    turned, inner = torch.tensor(frame.turned).double(), torch.tensor([0.01, 0.99], dtype=torch.float64)
+    low, high = torch.quantile(_thinned(true.points_m).double() @ turned.mT, inner, dim=0)
+    low, high = low - 0.05 * (high - low) - 1e-3, high + 0.05 * (high - low) + 1e-3
+    nats = torch.cat([cloud.colour for cloud in measured]).double()
+    least, most = torch.quantile(_thinned(nats), inner).tolist() if len(nats) else (0.0, 1.0)
+    clouds = (true, *measured)
+    grid, dots = figure.add_gridspec(2, len(clouds), height_ratios=(3.8, 4.8 * tall)), []
+    for k, cloud in enumerate(clouds):
+        space: Any = figure.add_subplot(grid[0, k], projection="3d")
+        seen = figure.add_subplot(grid[1, k])
+        points = cloud.points_m.double() @ turned.mT
+        inside = ((points >= low) & (points <= high)).all(-1)
+        shown, places, colour = (np.asarray(_thinned(t[inside])) for t in (points, cloud.seen_deg, cloud.colour))
+        scale: dict[str, Any] = {} if k == 0 else {"cmap": "viridis", "vmin": least, "vmax": max(most, least + 1e-3)}
+        alike: dict[str, Any] = {"c": colour, "s": 5.0 if k == 0 else 2.0, "linewidths": 0, "rasterized": True, **scale}
+        space.scatter(*shown.T, depthshade=False, **alike)
+        dots.append(seen.scatter(*places.T, **alike))
+        _in_space(space, frame.axes, low.tolist(), high.tolist())
+        space.set_title(cloud.name, fontsize=13)
+        seen.set(xlabel="right of the left eye's axis [°]", ylabel="above it [°]", aspect="equal", facecolor="0.88")
+        seen.set(xlim=edges[:, 0].tolist(), ylim=edges[:, 1].tolist())
+    bar: dict[str, Any] = {"location": "bottom", "shrink": 0.5, "aspect": 40}
+    figure.colorbar(dots[-1], ax=figure.axes, label="information of a point, −log|Σ| [nats]", **bar)
+    write_figure(path, figure, dpi=120)
+
+
+def _in_space(axes: Any, names: Sequence[str], low: Sequence[float], high: Sequence[float]) -> None:
+    """Name and limit the axes of a cloud in space."""
+    for axis, name, least, most in zip("xyz", names, low, high, strict=True):
+        axes.set(**{f"{axis}label": f"{name} [m]", f"{axis}lim": (least, most)})
+        getattr(axes, f"{axis}axis").set_pane_color((0.88, 0.88, 0.88, 1.0))
+    axes.set_box_aspect([most - least for least, most in zip(low, high, strict=True)], zoom=1.08)
+    axes.locator_params(nbins=4)
+    axes.view_init(**VIEW)
+
+
+def _thinned(points: Tensor) -> Tensor:
+    """Every k-th point, so that no more than MOST are left."""
+    return points[:: max(1, -(-len(points) // MOST))]
