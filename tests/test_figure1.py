@@ -15,7 +15,7 @@ from torchfovea.commands.shared import pictures
 from torchfovea.commands.shared.build import build_observer
 from torchfovea.commands.shared.composed import compose_search
 from torchfovea.commands.shared.pictures import draw_precision
-from torchfovea.commands.shared.precision import measured, seen_from
+from torchfovea.commands.shared.precision import bearings_deg, measured
 from torchfovea.gaussian import Gaussian
 from torchfovea.sensing.head import Eyes, Gaze, eyes
 
@@ -108,9 +108,9 @@ def test_seen_from_an_eye():
     right, down, axis = pose.R_left.unbind(-1)
     points = pose.t_left + torch.stack([2 * axis, axis + right, axis - down * 0.5, axis + right - down])
     expected = [[0, 0], [45, 0], [0, np.degrees(np.arctan(0.5))], [45, np.degrees(np.arctan(1 / np.sqrt(2)))]]
-    assert np.allclose(seen_from(pose, points), expected, atol=1e-9)
+    assert np.allclose(bearings_deg(pose, points), expected, atol=1e-9)
     home = Eyes(torch.eye(3), torch.zeros(3), torch.eye(3), torch.zeros(3))
-    assert seen_from(home, torch.tensor([[1.0, 1.0, 1.0]]))[0, 1] < 0  # down in the camera's frame
+    assert bearings_deg(home, torch.tensor([[1.0, 1.0, 1.0]]))[0, 1] < 0  # down in the camera's frame
 
 
 def compose_head():

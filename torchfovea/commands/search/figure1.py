@@ -8,7 +8,7 @@ import torch
 from omegaconf import DictConfig
 
 from torchfovea.commands.shared.build import build_arena, build_observer, name_of
-from torchfovea.commands.shared.precision import EGO, Cloud, both_sensors, headline, measured, seen_from
+from torchfovea.commands.shared.precision import EGO, Cloud, bearings_deg, both_sensors, headline, measured
 from torchfovea.gaussian import Gaussian, columns
 from torchfovea.perception import Observer
 from torchfovea.sensing.chart import cartesian_from_inverse_range
@@ -77,4 +77,4 @@ def _true(world: World, pose: Eyes) -> Cloud:
     seen = world.correspond(None, world.image_camera.rays(px))
     colour = image[:, ::step, ::step].flatten(1).T
     points = seen.points_e[seen.hit]
-    return Cloud("true surfaces, in the picture's colours", points, seen_from(pose, points), colour[seen.hit])
+    return Cloud("true surfaces, in the picture's colours", points, bearings_deg(pose, points), colour[seen.hit])

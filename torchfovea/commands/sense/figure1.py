@@ -12,7 +12,7 @@ from torchfovea.commands.sense.points import Sensed
 from torchfovea.commands.shared.budgets import build_budget
 from torchfovea.commands.shared.build import build_sensor
 from torchfovea.commands.shared.pairs import Pair
-from torchfovea.commands.shared.precision import CAMERA, Cloud, both_sensors, headline, measured, seen_from
+from torchfovea.commands.shared.precision import CAMERA, Cloud, bearings_deg, both_sensors, headline, measured
 from torchfovea.gaussian import columns
 from torchfovea.sensing.correspondence import Budget
 from torchfovea.sensing.head import Eyes
@@ -65,7 +65,7 @@ def draw_figure1(
         clouds.append(measured(headline(name, retina), AT_HOME, sensed.points, sensed.chosen, sensed.observed.inlier))
     if true is None:
         points, colour = sensed.points.mean[sensed.chosen], sensed.colour[sensed.chosen]
-        true = Cloud("measured, in the picture's colours", points, seen_from(AT_HOME, points), colour)
+        true = Cloud("measured, in the picture's colours", points, bearings_deg(AT_HOME, points), colour)
     draw_precision(path, true, clouds, CAMERA)
 
 
@@ -81,4 +81,4 @@ def _true(pair: Pair) -> Cloud | None:
     points = pair.camera_left.rays(px) * depth[..., None]
     known = torch.isfinite(depth) & (depth > 0)
     points, colour = points[known], pair.left[:, ::step, ::step].movedim(0, -1)[known]
-    return Cloud("truth, in the picture's colours", points, seen_from(AT_HOME, points), colour)
+    return Cloud("truth, in the picture's colours", points, bearings_deg(AT_HOME, points), colour)

@@ -18,7 +18,7 @@ from torchfovea.sensing.head import Eyes
 from torchfovea.sensing.layout import Retina
 from torchfovea.setting import require
 
-__all__ = ["CAMERA", "EGO", "Cloud", "PlotFrame", "both_sensors", "headline", "measured", "seen_from"]
+__all__ = ["CAMERA", "EGO", "Cloud", "PlotFrame", "bearings_deg", "both_sensors", "headline", "measured"]
 
 LAYOUTS = ("uniform", "log_polar")
 SHARED = ("camera", "fov_deg", "radius_px", "sample", "source_px")  # what both sensors have alike, beside their number
@@ -83,7 +83,7 @@ def both_sensors(cfg: DictConfig, retina: Retina | None) -> dict[str, DictConfig
     return found
 
 
-def seen_from(eye: Eyes, points_m: Tensor) -> Tensor:
+def bearings_deg(eye: Eyes, points_m: Tensor) -> Tensor:
     """Where the left one of two eyes sees points (N, 3): right of its axis and above it, (N, 2) [degrees]."""
     x, y, z = ((points_m - eye.t_left.to(points_m)) @ eye.R_left.to(points_m)).unbind(-1)
     return torch.rad2deg(torch.stack([torch.atan2(x, z), torch.atan2(-y, torch.hypot(x, z))], -1))
@@ -101,7 +101,7 @@ def measured(name: str, eye: Eyes, points: Gaussian, kept: Tensor, inlier: Tenso
     """
     shown = kept if inlier is None else kept & (inlier > 0.5)
     mean, cov = points.mean[shown], points.cov[shown]
-    return Cloud(name, mean, seen_from(eye, mean), information(cov) if len(cov) else torch.empty(0))
+    return Cloud(name, mean, bearings_deg(eye, mean), information(cov) if len(cov) else torch.empty(0))
 
 
 def headline(layout: str, retina: Retina) -> str:
