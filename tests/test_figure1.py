@@ -9,7 +9,7 @@ from PIL import Image
 from skimage.data import stereo_motorcycle
 
 from torchfovea.cli import main
-from torchfovea.commands.search.figure1 import draw_figure1, sensors_of
+from torchfovea.commands.search.figure1 import draw_scene, sensors_of
 from torchfovea.commands.sense.figure1 import AT_HOME
 from torchfovea.commands.shared import pictures
 from torchfovea.commands.shared.build import build_observer
@@ -84,7 +84,7 @@ def test_without_images_and_without_truth(tmp_path, drawn, pair):
     """The geometric sensor has the figure, too; a pair without truth shows what was measured."""
     cfg = compose_search((*SMALL, "fidelity=geometric", "sensor.receptive_fields=800", "figure1=true"))
     observer = build_observer(cfg)
-    draw_figure1(tmp_path / "figure1.png", sensors_of(cfg, observer), 0, Gaze(*torch.zeros(3, dtype=torch.float64)))
+    draw_scene(tmp_path / "figure1.png", sensors_of(cfg, observer), 0, Gaze(*torch.zeros(3, dtype=torch.float64)))
     run("sense", *pair[0], "sensor.receptive_fields=1000", f"hydra.run.dir={tmp_path}/run")
     (_, room, geometric, _), (_, shown, clouds, _) = drawn
     assert len(geometric) == 2 and len(room.points_m) > 1000

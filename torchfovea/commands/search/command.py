@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
 
-from torchfovea.commands.search.figure1 import draw_figure1, sensors_of
+from torchfovea.commands.search.figure1 import draw_scene, sensors_of
 from torchfovea.commands.search.remembering import (
     Best,
     best_fixation,
@@ -105,7 +105,7 @@ def run(cfg: DictConfig) -> float:
         _draw(folder, cfg, observer.retina, last, rows[-1])
     if both:
         gaze = Gaze(*(angle[-1] for angle in last.gaze))
-        draw_figure1(folder / "figure1.png", both, seed + episodes - 1, gaze)
+        draw_scene(folder / "figure1.png", both, seed + episodes - 1, gaze)
     if saved is not None:
         save_memory(saved, last.step.memory)
     summary = summarize(rows)

@@ -8,7 +8,7 @@ import torch
 from omegaconf import DictConfig
 
 from torchfovea.commands.shared.build import build_arena, build_observer, name_of
-from torchfovea.commands.shared.precision import EGO, Cloud, bearings_deg, both_sensors, headline, measured
+from torchfovea.commands.shared.precision import EGO, Dots, bearings_deg, both_sensors, headline, measured
 from torchfovea.gaussian import Gaussian, columns
 from torchfovea.perception import Observer
 from torchfovea.sensing.chart import cartesian_from_inverse_range
@@ -17,7 +17,7 @@ from torchfovea.sensing.triangulation import observe
 from torchfovea.setting import require
 from torchfovea.sim.world import World
 
-__all__ = ["Sensors", "draw_figure1", "sensors_of"]
+__all__ = ["Sensors", "draw_scene", "sensors_of"]
 
 Sensors = dict[str, tuple[DictConfig, Observer]]
 
@@ -39,7 +39,7 @@ def sensors_of(cfg: DictConfig, observer: Observer) -> Sensors:
     return {name: (node, observer if name == ours else build_observer(node)) for name, node in found.items()}
 
 
-def draw_figure1(path: Path, sensors: Sensors, seed: int, gaze: Gaze) -> None:
+def draw_scene(path: Path, sensors: Sensors, seed: int, gaze: Gaze) -> None:
     """Look once more where the head looked, with each retina.
 
     Args:
@@ -68,7 +68,7 @@ def draw_figure1(path: Path, sensors: Sensors, seed: int, gaze: Gaze) -> None:
     draw_precision(path, true, clouds, EGO)
 
 
-def _true(world: World, pose: Eyes) -> Cloud:
+def _true(world: World, pose: Eyes) -> Dots:
     """The first surfaces of the left eye's picture, in the picture's colours."""
     image = world.images()[0].image
     step = max(1, world.source_px // SHOWN_PX)
@@ -77,4 +77,4 @@ def _true(world: World, pose: Eyes) -> Cloud:
     seen = world.correspond(None, world.image_camera.rays(px))
     colour = image[:, ::step, ::step].flatten(1).T
     points = seen.points_e[seen.hit]
-    return Cloud("true surfaces, in the picture's colours", points, bearings_deg(pose, points), colour[seen.hit])
+    return Dots("true surfaces, in the picture's colours", points, bearings_deg(pose, points), colour[seen.hit])

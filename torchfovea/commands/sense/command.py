@@ -13,8 +13,8 @@ from rich.table import Table
 
 from torchfovea.cloud import COVARIANCE, write_ply
 from torchfovea.commands.sense.checks import examine, examine_map, health_of
-from torchfovea.commands.sense.figure1 import draw_figure1, retinas_of
-from torchfovea.commands.sense.points import Sensed, look
+from torchfovea.commands.sense.figure1 import draw_pair, retinas_of
+from torchfovea.commands.sense.points import Sensed, match_and_sense
 from torchfovea.commands.sense.report import beside, image_seen, match_figures, read_at_fields
 from torchfovea.commands.shared.budgets import build_budget
 from torchfovea.commands.shared.build import build_match, build_sensor, choice, name_of
@@ -61,7 +61,7 @@ def run(cfg: DictConfig) -> float | None:
     views = views.whole() if whole else views
     budget, folder = misaligned(budget, found_out.rows_px), run_folder()
 
-    sensed, found = look(match, views, printed, retina, budget)
+    sensed, found = match_and_sense(match, views, printed, retina, budget)
     foreign = isinstance(match, Matcher) and isinstance(match.params, External) and views.rectified
     if foreign and isinstance(found, Disparity) and found_out.matches is not None:
         told += examine_map(found.disparity, found.valid, found_out.matches, views, health)
@@ -82,8 +82,8 @@ def run(cfg: DictConfig) -> float | None:
 
     draw_sense(folder / "sense.png", pair.left, found, retina, observed, sensed.matches.left_px)
     if both:
-        alike = partial(look, match, looked, printed)
-        draw_figure1(folder / "figure1.png", pair, both, lambda r, b: alike(r, misaligned(b, found_out.rows_px))[0])
+        alike = partial(match_and_sense, match, looked, printed)
+        draw_pair(folder / "figure1.png", pair, both, lambda r, b: alike(r, misaligned(b, found_out.rows_px))[0])
     write_result(folder, {**figures, "gaze_right_px": right_px, "warnings": told})
     grid = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     for name, value in figures.items():

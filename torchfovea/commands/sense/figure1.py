@@ -12,13 +12,13 @@ from torchfovea.commands.sense.points import Sensed
 from torchfovea.commands.shared.budgets import build_budget
 from torchfovea.commands.shared.build import build_sensor
 from torchfovea.commands.shared.pairs import Pair
-from torchfovea.commands.shared.precision import CAMERA, Cloud, bearings_deg, both_sensors, headline, measured
+from torchfovea.commands.shared.precision import CAMERA, Dots, bearings_deg, both_sensors, headline, measured
 from torchfovea.gaussian import columns
 from torchfovea.sensing.correspondence import Budget
 from torchfovea.sensing.head import Eyes
 from torchfovea.sensing.layout import Retina
 
-__all__ = ["draw_figure1", "retinas_of"]
+__all__ = ["draw_pair", "retinas_of"]
 
 SHOWN_PX = 250  # columns and rows of the cloud in colour
 AT_HOME = Eyes(torch.eye(3), torch.zeros(3), torch.eye(3), torch.zeros(3))  # points are in the left camera's frame
@@ -43,7 +43,7 @@ def retinas_of(cfg: DictConfig, retina: Retina | None, budget: Budget) -> dict[s
     }
 
 
-def draw_figure1(
+def draw_pair(
     path: Path,
     pair: Pair,
     retinas: Mapping[str, tuple[Retina, Budget]],
@@ -65,11 +65,11 @@ def draw_figure1(
         clouds.append(measured(headline(name, retina), AT_HOME, sensed.points, sensed.chosen, sensed.observed.inlier))
     if true is None:
         points, colour = sensed.points.mean[sensed.chosen], sensed.colour[sensed.chosen]
-        true = Cloud("measured, in the picture's colours", points, bearings_deg(AT_HOME, points), colour)
+        true = Dots("measured, in the picture's colours", points, bearings_deg(AT_HOME, points), colour)
     draw_precision(path, true, clouds, CAMERA)
 
 
-def _true(pair: Pair) -> Cloud | None:
+def _true(pair: Pair) -> Dots | None:
     """The true surfaces of a rectified pair, in the left image's colours."""
     if pair.disparity is None:
         return None
@@ -81,4 +81,4 @@ def _true(pair: Pair) -> Cloud | None:
     points = pair.camera_left.rays(px) * depth[..., None]
     known = torch.isfinite(depth) & (depth > 0)
     points, colour = points[known], pair.left[:, ::step, ::step].movedim(0, -1)[known]
-    return Cloud("truth, in the picture's colours", points, bearings_deg(AT_HOME, points), colour)
+    return Dots("truth, in the picture's colours", points, bearings_deg(AT_HOME, points), colour)

@@ -20,7 +20,7 @@ from torchfovea.stereo.matchers import Match, Matcher, checked_matches
 from torchfovea.stereo.views import Views
 from torchfovea.studies.calibration import mixture_std
 
-__all__ = ["Sensed", "look", "sense"]
+__all__ = ["Sensed", "match_and_sense", "sense"]
 
 
 class Sensed(NamedTuple):
@@ -41,7 +41,9 @@ class Sensed(NamedTuple):
     chosen: Tensor
 
 
-def look(match: Match, views: Views, printed: bool, retina: Retina | None, budget: Budget) -> tuple[Sensed, Any]:
+def match_and_sense(
+    match: Match, views: Views, printed: bool, retina: Retina | None, budget: Budget
+) -> tuple[Sensed, Any]:
     """What a matcher makes of a pair, as points and as its own map.
 
     Args:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfovea.commands.shared.precision import Cloud, PlotFrame
+from torchfovea.commands.shared.precision import Dots, PlotFrame
 from torchfovea.files import write_figure
 from torchfovea.metrics import information
 from torchfovea.search import Glance
@@ -115,7 +115,7 @@ def draw_glance(glance: Glance, path: Tensor, nats: Sequence[float], retina: Ret
     return figure
 
 
-def draw_precision(path: Path, true: Cloud, measured: Sequence[Cloud], frame: PlotFrame) -> None:
+def draw_precision(path: Path, true: Dots, measured: Sequence[Dots], frame: PlotFrame) -> None:
     """Draw the paper's Fig. 1: a scene, and what each retina knows of it; in space, and as the left eye sees it.
 
     Args:

@@ -18,7 +18,7 @@ from torchfovea.sensing.head import Eyes
 from torchfovea.sensing.layout import Retina
 from torchfovea.setting import require
 
-__all__ = ["CAMERA", "EGO", "Cloud", "PlotFrame", "bearings_deg", "both_sensors", "headline", "measured"]
+__all__ = ["CAMERA", "EGO", "Dots", "PlotFrame", "bearings_deg", "both_sensors", "headline", "measured"]
 
 LAYOUTS = ("uniform", "log_polar")
 SHARED = ("camera", "fov_deg", "radius_px", "sample", "source_px")  # what both sensors have alike, beside their number
@@ -40,7 +40,7 @@ CAMERA = PlotFrame(("x, right", "z, forward", "−y, up"), ((1, 0, 0), (0, 0, 1)
 EGO = PlotFrame(("−y, right", "x, forward", "z, up"), ((0, -1, 0), (1, 0, 0), (0, 0, 1)))
 
 
-class Cloud(NamedTuple):
+class Dots(NamedTuple):
     """Points that are drawn together.
 
     Attributes:
@@ -89,7 +89,7 @@ def bearings_deg(eye: Eyes, points_m: Tensor) -> Tensor:
     return torch.rad2deg(torch.stack([torch.atan2(x, z), torch.atan2(-y, torch.hypot(x, z))], -1))
 
 
-def measured(name: str, eye: Eyes, points: Gaussian, kept: Tensor, inlier: Tensor | None) -> Cloud:
+def measured(name: str, eye: Eyes, points: Gaussian, kept: Tensor, inlier: Tensor | None) -> Dots:
     """What a retina measured, as precise as it says it is (Eq. 44).
 
     Args:
@@ -101,7 +101,7 @@ def measured(name: str, eye: Eyes, points: Gaussian, kept: Tensor, inlier: Tenso
     """
     shown = kept if inlier is None else kept & (inlier > 0.5)
     mean, cov = points.mean[shown], points.cov[shown]
-    return Cloud(name, mean, bearings_deg(eye, mean), information(cov) if len(cov) else torch.empty(0))
+    return Dots(name, mean, bearings_deg(eye, mean), information(cov) if len(cov) else torch.empty(0))
 
 
 def headline(layout: str, retina: Retina) -> str:
