@@ -15,7 +15,10 @@ from torchfovea.commands.benchmark.protocol import TRACKS
 from torchfovea.imported import load_function
 from torchfovea.setting import require
 
-__all__ = ["Entry", "entries_of"]
+__all__ = ["FAMILY", "Entry", "entries_of"]
+
+FAMILY = "{family}"
+"""In an entry's configuration, the name of the family that it is asked about."""
 
 # settings that an entry may choose, by track; everything else is the protocol's
 OPEN = {
@@ -33,7 +36,8 @@ class Entry:
     Attributes:
         name: in the leaderboard.
         track: which.
-        config: settings of `torchfovea search`, of the groups that the track leaves open.
+        config: settings of `torchfovea search`, of the groups that the track leaves open; `FAMILY` in them is the
+            family's name.
         function: ``module:function``, in the track's form.
         command: a program with its arguments, see `torchfovea.commands.benchmark.processes`.
     """

@@ -12,7 +12,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from torchfovea.commands.benchmark.entries import Entry
+from torchfovea.commands.benchmark.entries import FAMILY, Entry
 from torchfovea.commands.benchmark.processes import LinePolicy, ask_matcher, ask_memory
 from torchfovea.commands.benchmark.protocol import FAMILIES, Size
 from torchfovea.commands.shared.build import build_arena, build_cells, build_match, build_observer
@@ -87,7 +87,8 @@ def _settings(unit: Unit, images: bool) -> DictConfig:
         f"sensor.source_px={size.source_px}", "sensor.sample=null", "stop.probability=null",
         "motor=instant", "renderer=rays",
     ]  # fmt: skip
-    return compose_search((*FAMILIES[unit.family], *unit.entry.config, *own), unit.folders)
+    chosen = [line.replace(FAMILY, unit.family) for line in unit.entry.config]
+    return compose_search((*FAMILIES[unit.family], *chosen, *own), unit.folders)
 
 
 @contextmanager
