@@ -54,6 +54,14 @@ def fuse(cells, looks):
     moments = belief(memory)
     return moments.mean[:, 2], torch.where(memory.looks > 0, moments.cov[:, 5].sqrt(), torch.inf)
 
+def blind(views, retina, budget):
+    found = match(views, retina, budget)
+    return found[0]._replace(right_px=found[0].right_px * float("nan")), found[1]
+
+def few(views, retina, budget):
+    found = match(views, retina, budget)
+    return found[0]._replace(right_px=found[0].right_px[:5]), found[1]
+
 def forgetful(cells, looks):
     return cells[:, 0] * float("nan"), torch.ones(len(cells))
 """
@@ -163,6 +171,9 @@ def test_mistakes_are_named_in_the_record_and_harm_nobody_else(bench):
         {"name": "gone", "track": "policy", "command": bench.program("gone")},
         {"name": "not there", "track": "policy", "command": "/nowhere/program"},
         function("NaN memory", "memory", "forgetful"), function("good", "policy", "greedy"),
+        function("NaN matches", "matcher", "blind"), function("few matches", "matcher", "few"),
+        function("raises at last", "whole", "raising"),
+        {"name": "no bias", "track": "policy", "config": ["memory=fitted_{family}"]},
     ]  # fmt: skip
     status, records, said = bench(entries)
     assert status == 0 and records["good"]["errors"] == {} and records["good"]["families"]["open"]["rows"]
@@ -171,6 +182,8 @@ def test_mistakes_are_named_in_the_record_and_harm_nobody_else(bench):
         "raises": "ZeroDivisionError: by nothing", "NaN": "scores = NaN: expected a number for every eligible cell",
         "wrong shape": "scores", "beyond": "command's answer = 1000000: expected a cell, 0 to 79", "gone": "command = ",
         "not there": "command = /nowhere/program: expected a program", "NaN memory": "memory's answer = NaN",
+        "NaN matches": "matcher's", "few matches": "matcher's", "raises at last": "ZeroDivisionError: by nothing",
+        "no bias": "memory = fitted_open",
     }  # fmt: skip
     assert set(errors) == set(expected)
     for name, line in expected.items():

@@ -260,6 +260,26 @@ def test_actions_that_are_none(action, complaint):
         env.step(action)
 
 
+def test_one_row_s_bad_action_is_refused_before_any_row_moves():
+    env = vector(3, fidelity="cells")
+    with pytest.raises(SettingError, match=r"step = no episode"):
+        env.step(np.zeros((3, 2), np.float32))
+    env.reset(seed=0)
+    for value in (math.nan, math.inf, -1.5):
+        actions = np.zeros((3, 2), np.float32)
+        actions[1, 0] = value
+        with pytest.raises(SettingError, match=r"action = "):
+            env.step(actions)
+    with pytest.raises(SettingError, match=r"action\.shape = \(2, 2\): expected \(3, 2\)"):
+        env.step(np.zeros((2, 2), np.float32))
+    cells = vector(2, fidelity="cells", action="cell")
+    cells.reset(seed=0)
+    for bad, complaint in (([0, 80], r"values from 0 to 80: expected an element of 0 to 79"), ([0.5, 1], "float64")):
+        with pytest.raises(SettingError, match=complaint):
+            cells.step(np.array(bad))
+    assert env.rows.time.tolist() == [0, 0, 0] and cells.rows.time.tolist() == [0, 0]
+
+
 @pytest.mark.parametrize(
     ("settings", "complaint"),
     [
