@@ -3,7 +3,7 @@
 python scripts/fit_bias.py FOLDER [scenes=64] [components=2]
 
 Leaves FOLDER/memory/fitted_FAMILY.yaml for each family. They take part in the benchmark with --config-dir FOLDER, as
-{name: fitted bias, track: policy, config: ["memory=fitted_{family}", acquisition=ei]}, see docs/benchmark.md.
+{name: fitted bias, track: policy, config: ["memory=fitted_{family}", "acquisition=ei"]}, see docs/benchmark.md.
 """
 
 from __future__ import annotations
