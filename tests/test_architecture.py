@@ -120,6 +120,7 @@ ONLY_IN = {
         "sgbm",
         "sparse",
         "untrusted",
+        "volume",
         "calibration_formats",
         "recordings",
         "commands",

@@ -18,7 +18,8 @@ from torchfovea.sim.cans import Cans
 from torchfovea.sim.model import EgoPose
 from torchfovea.sim.rays import cast
 from torchfovea.sim.scene import AttentionWorld, build_scene, stand_at
-from torchfovea.sim.trace import occluded, solids_of, trace
+from torchfovea.sim.solids import solids_of
+from torchfovea.sim.trace import occluded, trace
 from torchfovea.sim.world import World
 
 

@@ -22,7 +22,8 @@ from torchfovea.setting import require
 from torchfovea.sim.model import Scene
 from torchfovea.sim.motor import InstantMotor, Motor
 from torchfovea.sim.room import FLOOR, TARGET
-from torchfovea.sim.trace import occluded, ranges, solids_of, take, trace
+from torchfovea.sim.solids import solids_of, take
+from torchfovea.sim.trace import occluded, ranges, trace
 
 __all__ = ["GeometricArenas"]
 

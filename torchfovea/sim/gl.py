@@ -26,7 +26,6 @@ from torchfovea.sim.texture import colour
 __all__ = ["available_gl", "opengl", "render"]
 
 _TEXELS = {FLOOR: 1400, ROOM: 512, FURNITURE: 192, POLE: 24, CAN: 128, TARGET: 128}  # a side of a cube map
-_BAKED = 8192  # texels coloured at once
 _SLAB_M = 0.01  # half thickness of the floor here: planes take no cube map
 # OpenGL's cube faces: which axis they face, and the axes and signs of their columns and rows
 _FACES = (
@@ -94,15 +93,17 @@ def _texture(scene: Scene, geom: int, solid: Solid) -> np.ndarray:
             place /= np.maximum(radial, upright)[..., None]
             curved = (radial >= upright)[..., None]
             normal = np.where(curved, place * [1.0, 1.0, 0.0], np.sign(place) * [0.0, 0.0, 1.0])
-        points = ((place * size) @ turn.T + solid.position_m).reshape(-1, 3).astype(np.float32)
-        facing = (normal @ turn.T).reshape(-1, 3).astype(np.float32)
-        width = np.float32(2 * max(size[across], size[down]) / side)
-        for start in range(0, side * side, _BAKED):
-            rows = slice(start, start + _BAKED)
-            n = len(points[rows])
-            rgb = colour(scene.paint, np.full(n, geom), points[rows], facing[rows], np.full(n, width))
-            sheet[face].reshape(-1, 3)[rows] = np.round(rgb * 255)
+        points = (place * size) @ turn.T + solid.position_m
+        width = torch.full((side, side), 2 * max(size[across], size[down]) / side)
+        rgb = colour(scene.paint, torch.full((side, side), geom), _parts(points), _parts(normal @ turn.T), width)
+        sheet[face] = (255 * rgb).round().byte().permute(1, 2, 0).numpy()
     return sheet.reshape(6 * side, side, 3)
+
+
+def _parts(vectors: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
+    """Vectors (..., 3) by component, in single precision."""
+    x, y, z = torch.from_numpy(vectors).float().movedim(-1, 0).contiguous()
+    return x, y, z
 
 
 def _half_size(solid: Solid) -> tuple[float, float, float]:

@@ -1,12 +1,13 @@
-"""Rays through a scene: ranges, and pictures without any GL."""
+"""Rays through a scene: ranges by MuJoCo, and pictures without any GL."""
 
 from __future__ import annotations
 
 import os
+import weakref
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -15,8 +16,8 @@ from torch import Tensor
 from torchfovea.sensing.camera import Camera
 from torchfovea.setting import require
 from torchfovea.sim.backend import load_mujoco
+from torchfovea.sim.drawing import Painted, draw_pictures, paint_scenes
 from torchfovea.sim.model import Scene
-from torchfovea.sim.texture import colour
 
 __all__ = ["MISS_RANGE_M", "Frame", "RayHits", "Renderer", "cast", "render"]
 
@@ -24,10 +25,7 @@ MISS_RANGE_M = 1000.0
 """The range that a ray gets which meets nothing; its geom is -1."""
 
 _PARALLEL_FROM = 4000  # rays below which a second thread costs more than it saves
-_SKY = (0.62, 0.72, 0.82)
-_STEEPEST = np.float32(0.12)  # cosine of the slant at which the footprint stops growing
 _CUTOFF_M = 1e6  # surfaces beyond are misses
-_CHUNK = 40000  # pixels shaded at once: they stay in the cache
 
 
 class RayHits(NamedTuple):
@@ -164,80 +162,40 @@ def cast(scene: Scene, origin_e: Tensor, directions_e: Tensor) -> RayHits:
     )
 
 
-@lru_cache(maxsize=8)
-def _pixel_rays(camera: Camera, size_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit rays (H·W, 3) and the angle that each pixel spans (H·W,) [rad]."""
-    index = torch.arange(size_px, dtype=torch.float64)
-    v, u = torch.meshgrid(index, index, indexing="ij")
-    px = torch.stack([u, v], -1)
-    ray = torch.nn.functional.normalize(camera.rays(px), dim=-1)
-    spans = []
-    for step in ((0.5, 0.0), (0.0, 0.5)):
-        shift = torch.tensor(step, dtype=torch.float64)
-        ends = [torch.nn.functional.normalize(camera.rays(px + s * shift), dim=-1) for s in (-1, 1)]
-        spans.append((ends[1] - ends[0]).norm(dim=-1))
-    return ray.reshape(-1, 3).numpy(), torch.maximum(*spans).reshape(-1).float().numpy()
+_painted: weakref.WeakKeyDictionary[Any, dict[torch.device, Painted]] = weakref.WeakKeyDictionary()
+
+
+def _paint(scene: Scene, device: torch.device) -> Painted:
+    """A scene as tensors; wherever the robot stands, they are the same."""
+    known = _painted.setdefault(scene.model, {})
+    if device not in known:
+        known[device] = paint_scenes([scene], device)
+    return known[device]
 
 
 def render(scene: Scene, R: Tensor, t: Tensor, camera: Camera, size_px: int) -> Frame:
-    """A square picture by ray casting, textured by `torchfovea.sim.texture`. Not differentiable.
+    """A square picture by tensors (`torchfovea.sim.drawing`), textured by `torchfovea.sim.texture`. Not differentiable.
 
     Args:
         scene: what to look at.
-        R: (3, 3), columns are the camera's axes in E.
+        R: (3, 3), columns are the camera's axes in E; it is drawn on the device of R.
         t: (3,), the camera's centre in E [m].
         camera: of the image (`torchfovea.sensing.camera.image_camera`); pixel centres are integers.
         size_px: side of the picture, >= 2.
 
     Raises:
-        SettingError: wrong shapes or size.
+        SettingError: wrong shapes or size, or an eye outside of a closed room.
     """
     require(isinstance(size_px, int) and 2 <= size_px <= 8192, "size_px", size_px, "a whole number from 2 to 8192")
     require(R.shape == (3, 3), "R", tuple(R.shape), "(3, 3)")
     require(t.shape == (3,), "t", tuple(t.shape), "(3,)")
-    ray, span = _pixel_rays(camera, size_px)
-    rotation, translation = scene.world_from_ego
-    turn = rotation @ R.detach().to("cpu", torch.float64).numpy()
-    origin = rotation @ t.detach().to("cpu", torch.float64).numpy() + translation
-    n = len(ray)
-    chunk = min(_CHUNK, -(-n // 2))
-    image = np.empty((3, n), np.float32)
-    distance = np.empty(n, np.float32)
-    geom = np.empty(n, np.int64)
-    normal = np.empty((n, 3), np.float32)
-    from_world, centre = rotation.astype(np.float32), origin.astype(np.float32)
-
-    def work(worker: int) -> None:
-        for start in range(worker * chunk, n, 2 * chunk):
-            rows = slice(start, min(start + chunk, n))
-            direction = ray[rows] @ turn.T
-            distance[rows], geom[rows], across64 = _cast_part(scene, worker, origin, direction)
-            across, way = across64.astype(np.float32), direction.astype(np.float32)
-            normal[rows] = across @ from_world
-            image[:, rows] = _shade(scene, centre, way, distance[rows], geom[rows], across, span[rows]).T
-
-    _in_parallel(n, work)
-    side = (size_px, size_px)
+    rotation, translation = (torch.from_numpy(part).to(R.device) for part in scene.world_from_ego)
+    turn, eye = rotation @ R.detach().double(), rotation @ t.detach().to(R.device).double() + translation
+    drawn = draw_pictures(_paint(scene, R.device), turn[None], eye[None], camera, size_px)
+    normal = rotation.float().T @ drawn.normal[0].reshape(3, -1)
     return Frame(
-        torch.from_numpy(image).reshape(3, *side),
-        torch.from_numpy(distance).reshape(side),
-        torch.from_numpy(geom).reshape(side),
-        torch.from_numpy(normal).reshape(*side, 3),
+        drawn.image[0],
+        drawn.range_m[0].clamp(max=MISS_RANGE_M),
+        drawn.geom[0],
+        normal.view(3, size_px, size_px).permute(1, 2, 0),
     )
-
-
-def _shade(
-    scene: Scene,
-    origin: np.ndarray,
-    direction: np.ndarray,
-    distance: np.ndarray,
-    geom: np.ndarray,
-    normal: np.ndarray,
-    span: np.ndarray,
-) -> np.ndarray:
-    """Colours (N, 3) of hits in the world; a miss is sky."""
-    point = origin + distance[:, None] * direction
-    slant = np.maximum(np.abs(np.einsum("ni,ni->n", direction, normal)), _STEEPEST)
-    rgb = colour(scene.paint, np.maximum(geom, 0), point, normal, distance * span / slant)
-    rgb[geom < 0] = _SKY
-    return rgb

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from torchfovea.sensing.head import Head
 from torchfovea.setting import require
@@ -187,12 +189,12 @@ def build_spec(solids: Sequence[Solid], head: Head) -> Any:
 def paint_solids(solids: Sequence[Solid], rng: np.random.Generator) -> Paint:
     """What the solids look like; the generator draws each one's place in the noise."""
 
-    def rows(values: Iterable[Sequence[float]]) -> np.ndarray:
-        return np.array(list(values), np.float32)
+    def columns(values: Iterable[Sequence[float]]) -> Tensor:
+        return torch.tensor(list(values), dtype=torch.float32).T.contiguous()
 
     return Paint(
-        look=rows((*s.base, *s.accent, s.contrast) for s in solids),
-        offset=rng.uniform(0, 20, (len(solids), 3)).astype(np.float32),
-        centre=rows(s.position_m for s in solids),
-        can=rows(s.size_m[:2] if s.label else (0.0, 0.0) for s in solids),
+        look=columns((*s.base, *s.accent, s.contrast) for s in solids),
+        offset=columns(rng.uniform(0, 20, (len(solids), 3)).tolist()),
+        centre=columns(s.position_m for s in solids),
+        can=columns(s.size_m[:2] if s.label else (0.0, 0.0) for s in solids),
     )

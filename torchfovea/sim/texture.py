@@ -4,8 +4,7 @@ Each geom has its own place in one periodic volume of band-limited noise: three 
 factor 8 apart, each turned so that no period lines up with a wall. An octave fades as its wavelength nears the pixel's
 footprint, hence far surfaces are smooth instead of aliased and two eyes see one colour.
 
-NumPy inside, but for one lookup: it keeps to the thread that calls it, whereas torch would start threads of its own in
-every thread that shades.
+Points come in rows of neighbours, and by components: a scale is looked up only for the rows in which it shows.
 """
 
 from __future__ import annotations
@@ -16,7 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-import torch.nn.functional as F
+from torch import Tensor
+
+from torchfovea.sensing.chart import Components
+from torchfovea.sim.volume import PeriodicVolume
 
 __all__ = ["Paint", "colour"]
 
@@ -24,32 +26,33 @@ _SIZE = 64  # voxels a side of the noise volume
 _WAVELENGTHS = (5.0, 10.0, 20.0)  # of its octaves [voxels]
 _VOXELS_M = (0.0006, 0.0048, 0.0384)  # the three scales: wavelengths 3 mm to 0.77 m
 _AMPLITUDES = (0.12, 0.14, 0.16, 0.17, 0.17, 0.15, 0.13, 0.12, 0.10)  # log albedo, fine to coarse
+_FAINTEST = 0.002  # log albedo below which an octave has all but vanished
 _PIXEL_SIGMA = 0.45  # of a pixel's Gaussian footprint, in pixels
 _AMBIENT = 0.5
 _LIGHTS = ((0.35, 0.45, 0.82, 0.42), (-0.75, -0.35, 0.56, 0.16))  # direction and strength, in the world
-_WHITE = np.array([0.93, 0.91, 0.87], np.float32)
-_SILVER = np.array([0.62, 0.63, 0.66], np.float32)
+_WHITE = (0.93, 0.91, 0.87)
+_SILVER = (0.62, 0.63, 0.66)
 
 
 class Paint(NamedTuple):
     """What each of G geoms looks like; float32.
 
     Attributes:
-        look: (G, 7), RGB; RGB mixed in at large scale; strength of the noise.
-        offset: (G, 3), its place in the noise, added to world coordinates [m].
-        centre: (G, 3), in the world [m].
-        can: (G, 2), radius and half height of an upright can's label [m]; 0 for everything else.
+        look: (7, G), RGB; RGB mixed in at large scale; strength of the noise.
+        offset: (3, G), its place in the noise, added to world coordinates [m].
+        centre: (3, G), in the world [m].
+        can: (2, G), radius and half height of an upright can's label [m]; 0 for everything else.
     """
 
-    look: np.ndarray
-    offset: np.ndarray
-    centre: np.ndarray
-    can: np.ndarray
+    look: Tensor
+    offset: Tensor
+    centre: Tensor
+    can: Tensor
 
 
-@lru_cache(maxsize=1)
-def _volume() -> torch.Tensor:
-    """The noise, (1, 4, S+1, S+1, S+1): three unit-variance octaves and a fourth, independent coarse one for colour."""
+@lru_cache(maxsize=4)
+def _volume(device: torch.device) -> PeriodicVolume:
+    """The noise: three octaves of unit variance and a fourth, independent coarse one for colour."""
     rng = np.random.default_rng(20180)
     f = np.fft.fftfreq(_SIZE)
     radius = np.sqrt(f[:, None, None] ** 2 + f[None, :, None] ** 2 + np.fft.rfftfreq(_SIZE)[None, None, :] ** 2)
@@ -60,26 +63,21 @@ def _volume() -> torch.Tensor:
         window = np.cos(math.pi / 2 * np.clip(octave + math.log2(wavelength), -1, 1))
         band = np.fft.irfftn(noise * window, (_SIZE,) * 3, axes=(0, 1, 2))
         bands.append(band / band.std())
-    # one voxel more on each far side closes the period for linear interpolation
-    volume = np.pad(np.stack(bands), ((0, 0), (0, 1), (0, 1), (0, 1)), mode="wrap")
-    # a voxel's channels side by side: one cache line instead of four
-    return torch.from_numpy(volume.astype(np.float32))[None].to(memory_format=torch.channels_last_3d)
+    return PeriodicVolume(np.stack(bands), device)
 
 
 @lru_cache(maxsize=1)
 def _turns() -> np.ndarray:
     """A fixed rotation for each scale, (3, 3, 3)."""
-    return np.linalg.qr(np.random.default_rng(7).standard_normal((3, 3, 3)))[0].astype(np.float32)
+    return np.linalg.qr(np.random.default_rng(7).standard_normal((3, 3, 3)))[0]
 
 
-def _noise(points: np.ndarray, scale: int, channels: int) -> np.ndarray:
-    """Noise at points (N, 3) [m], (C, N)."""
-    place = points @ (_turns()[scale] / np.float32(_VOXELS_M[scale] * _SIZE))
-    place -= np.floor(place)
-    place *= 2
-    place -= 1
-    grid = torch.from_numpy(place)[None, None, None]
-    return F.grid_sample(_volume()[:, :channels], grid, align_corners=True)[0, :, 0, 0].numpy()
+def _noise(point: Components, scale: int) -> tuple[Tensor, ...]:
+    """Noise at points (R, C) [m]: three octaves from fine to coarse, and that of the colour."""
+    x, y, z = point
+    turn = (_turns()[scale] / (_VOXELS_M[scale] * _SIZE)).T.tolist()
+    u, v, w = ((x * a).add_(y, alpha=b).add_(z, alpha=c) for a, b, c in turn)
+    return _volume(x.device).at(u, v, w)
 
 
 def _fading(scale: int) -> list[tuple[float, float]]:
@@ -91,84 +89,102 @@ def _fading(scale: int) -> list[tuple[float, float]]:
 def _widest(scale: int) -> float:
     """The footprint's variance at which a scale's coarsest octave has all but vanished."""
     amplitude, decay = _fading(scale)[-1]
-    return math.log(0.004 / amplitude) / decay
+    return math.log(_FAINTEST / amplitude) / decay
 
 
-def _octaves(noise: np.ndarray, spread: np.ndarray, scale: int) -> tuple[np.ndarray, np.ndarray]:
-    """Sum (N,) of a scale's faded octaves, and its variance (N,)."""
-    value, power = np.zeros_like(spread), np.zeros_like(spread)
-    for wave, (amplitude, decay) in zip(noise, _fading(scale), strict=False):
-        fade = np.exp(np.float32(decay) * spread) * np.float32(amplitude)
-        value += wave * fade
-        power += fade * fade
-    return value, power
+def _log_albedo(point: Components, spread: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Sum of the faded octaves, its variance, and the noise of the colour, each (R, C).
+
+    Args:
+        point: in the noise [m], (R, C) each.
+        spread: variance of the footprint [m²], (R, C).
+    """
+    last = len(_VOXELS_M) - 1
+
+    def octaves(noise: tuple[Tensor, ...], spread: Tensor, scale: int) -> tuple[Tensor, Tensor]:
+        value, power = torch.zeros_like(spread), torch.zeros_like(spread)
+        for wave, (amplitude, decay) in zip(noise, _fading(scale), strict=False):
+            fade = (spread * decay).exp_().mul_(amplitude)
+            value.addcmul_(wave, fade)
+            power.addcmul_(fade, fade)
+        return value, power
+
+    coarse = _noise(point, last)
+    value, power = octaves(coarse, spread, last)
+    narrowest = spread.amin(1)
+    for scale in range(last):
+        # most pixels are too wide for the finest octaves: look up only where they are not
+        rows = (narrowest < _widest(scale)).nonzero()[:, 0]
+        if len(rows) == 0:
+            continue
+        x, y, z = (part.index_select(0, rows) for part in point)
+        found = octaves(_noise((x, y, z), scale), spread.index_select(0, rows), scale)
+        value.index_add_(0, rows, found[0])
+        power.index_add_(0, rows, found[1])
+    return value, power, coarse[3]
 
 
-def _label(local: np.ndarray, size: np.ndarray, footprint: np.ndarray, base: np.ndarray) -> np.ndarray:
-    """A can's albedo (N, 3): its own colour with a white wave around it, metal at both ends."""
-    half = size[:, 1]
-    x, y, z = local.T
-    angle = np.arctan2(y, x)
+def _label(local: Components, size: Tensor, footprint: Tensor, base: Tensor) -> Tensor:
+    """A can's albedo (3, R, C): its own colour with a white wave around it, metal at both ends."""
+    half = size[1]
+    x, y, z = local
+    angle = torch.atan2(y, x)
     height = z / half
-    blur = np.maximum(footprint / half, 1e-3)
+    blur = (footprint / half).clamp(min=1e-3)
 
-    def inside(distance: np.ndarray) -> np.ndarray:  # 1 well inside, 0 well outside, a step as wide as the footprint
-        s = np.clip(0.5 + distance / (2 * blur), 0, 1)
-        step: np.ndarray = s * s * (3 - 2 * s)
-        return step[:, None]
+    def inside(distance: Tensor) -> Tensor:  # 1 well inside, 0 well outside, a step as wide as the footprint
+        s = (0.5 + distance / (2 * blur)).clamp(0, 1)
+        return s * s * (3 - 2 * s)
 
-    wave = 0.34 * np.sin(angle + 0.9 * np.sin(2 * angle))
-    ribbon = np.maximum(inside(0.13 - np.abs(height - wave)), inside(0.02 - np.abs(height - wave - 0.24)))
-    metal = inside(np.abs(height) - 0.9)
-    albedo = base + ribbon * (_WHITE - base)
-    plated: np.ndarray = albedo + metal * (_SILVER - albedo)
-    return plated
+    wave = 0.34 * torch.sin(angle + 0.9 * torch.sin(2 * angle))
+    ribbon = torch.maximum(inside(0.13 - (height - wave).abs()), inside(0.02 - (height - wave - 0.24).abs()))
+    metal = inside(height.abs() - 0.9)
+    white, silver = (base.new_tensor(c)[:, None, None] for c in (_WHITE, _SILVER))
+    albedo = base + ribbon * (white - base)
+    return albedo + metal * (silver - albedo)
 
 
-def colour(
-    paint: Paint, geom: np.ndarray, point_w: np.ndarray, normal_w: np.ndarray, footprint_m: np.ndarray
-) -> np.ndarray:
+def _light(normal: Components) -> Tensor:
+    """What falls on surfaces with unit normals (R, C)."""
+    light = torch.full_like(normal[0], _AMBIENT)
+    for a, b, c, strength in _LIGHTS:
+        facing = (normal[0] * a).add_(normal[1], alpha=b).add_(normal[2], alpha=c)
+        light.add_(facing.clamp_(min=0), alpha=strength)
+    return light
+
+
+def colour(paint: Paint, geom: Tensor, point: Components, normal: Components, footprint_m: Tensor) -> Tensor:
     """Colour of surface points, without any term that depends on the viewpoint but the pixel's own blur.
 
     Args:
         paint: of the scene.
-        geom: (N,) which geom each point lies on, >= 0.
-        point_w: (N, 3) in the world [m], float32 like all that follow.
-        normal_w: (N, 3), outward.
-        footprint_m: (N,) width of the pixel on the surface [m].
+        geom: (R, C) which geom each point lies on, >= 0; rows are of points near each other.
+        point: in the world [m], (R, C) each, float32 like all that follow.
+        normal: outward, (R, C) each.
+        footprint_m: (R, C) width of the pixel on the surface [m].
 
     Returns:
-        (N, 3) RGB in [0, 1].
+        (3, R, C) RGB in [0, 1].
     """
-    solid = point_w + paint.offset[geom]
-    spread = (np.float32(_PIXEL_SIGMA) * footprint_m) ** 2
-    look = paint.look[geom]
-    last = len(_VOXELS_M) - 1
-    coarse = _noise(solid, last, 4)
-    log_albedo, power = _octaves(coarse, spread, last)
-    for scale in range(last):
-        # most pixels are too wide for the finest octaves: look up only those that are not
-        rows = np.flatnonzero(spread < _widest(scale))
-        if len(rows) == 0:
-            continue
-        part = spread[rows]
-        value, own_power = _octaves(_noise(solid[rows], scale, 3), part, scale)
-        log_albedo[rows] += value
-        power[rows] += own_power
-    base = look[:, :3]
-    mix = np.float32(0.65) / (1 + np.exp(-3 * coarse[3]))
-    albedo: np.ndarray = base + mix[:, None] * (look[:, 3:6] - base)
-    rows = np.flatnonzero(paint.can[geom, 0] > 0)
+    which = geom.reshape(-1)
+
+    def told(table: Tensor) -> Tensor:  # (G,) of each point
+        return table.index_select(0, which).view_as(geom)
+
+    x, y, z = (told(table).add_(part) for table, part in zip(paint.offset, point, strict=True))
+    log_albedo, power, tint = _log_albedo((x, y, z), (_PIXEL_SIGMA * footprint_m).square_())
+    mix = tint.mul_(3).sigmoid_().mul_(0.65)
+    albedo = torch.stack([torch.lerp(told(paint.look[k]), told(paint.look[3 + k]), mix) for k in range(3)])
+    rows = (told(paint.can[0]).amax(1) > 0).nonzero()[:, 0]
     if len(rows) > 0:
-        own = geom[rows]
-        albedo[rows] = _label(point_w[rows] - paint.centre[own], paint.can[own], footprint_m[rows], albedo[rows])
-    contrast = look[:, 6]
+        own = geom.index_select(0, rows)
+        size = paint.can[:, own]
+        local = [part.index_select(0, rows) - c[own] for part, c in zip(point, paint.centre, strict=True)]
+        base, canned = albedo.index_select(1, rows), size[0] > 0
+        size = torch.where(canned, size, 1)
+        label = _label((local[0], local[1], local[2]), size, footprint_m.index_select(0, rows), base)
+        albedo.index_copy_(1, rows, torch.where(canned, label, base))
+    contrast = told(paint.look[6])
     # the mean of exp(noise) shrinks as octaves fade; put it back, or far walls would darken
-    gain = np.exp(contrast * log_albedo - contrast * contrast * power / 2)
-    light = np.full_like(gain, _AMBIENT)
-    for x, y, z, strength in _LIGHTS:
-        facing = normal_w @ np.array([x, y, z], np.float32)
-        light += np.float32(strength) * np.maximum(facing, 0)
-    albedo *= (gain * light)[:, None]
-    np.clip(albedo, 0, 1, out=albedo)
-    return albedo
+    gain = log_albedo.mul_(contrast).addcmul_(contrast.square_(), power, value=-0.5).exp_()
+    return albedo.mul_(gain.mul_(_light(normal))).clamp_(0, 1)

@@ -7,147 +7,15 @@ the floor, a wall or the ceiling; the other solids are tried only for the rays t
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchfovea.setting import require
-from torchfovea.sim.model import Scene
-from torchfovea.sim.room import FLOOR, ROOM, Solid
+from torchfovea.sim.solids import Group, Solids, chord, first, tiny, way_out
 
-__all__ = ["Solids", "occluded", "ranges", "solids_of", "take", "trace"]
-
-
-def _tiny(dtype: torch.dtype) -> float:
-    """A step that stands for none: its inverse times any length in a scene is finite."""
-    return torch.finfo(dtype).tiny * 1e8
-
-
-class _Group(NamedTuple):
-    """Solids of one shape in B scenes, padded to K with solids far below that no ray meets.
-
-    Attributes:
-        centre: x, y and z, (3, B, K, 1).
-        size: up to three half lengths, or radius and half height, or radius, (3, B, K, 1).
-        turn: cosine and sine of the yaw, (2, B, K, 1).
-        geom: (B, K).
-    """
-
-    centre: Tensor
-    size: Tensor
-    turn: Tensor
-    geom: Tensor
-
-
-class Solids(NamedTuple):
-    """B scenes as tensors, in each scene's world.
-
-    Attributes:
-        middle: of the room, (3, B, 1).
-        half: its half lengths, (3, B, 1).
-        faces: geoms that close it toward −x, x, −y, y, −z and z, (6, B).
-        boxes: turned boxes.
-        cylinders: upright.
-        spheres: of any size.
-        rotation: yaw of E as cosine and sine, (2, B, 1).
-        translation: of E, (3, B, 1).
-    """
-
-    middle: Tensor
-    half: Tensor
-    faces: Tensor
-    boxes: _Group
-    cylinders: _Group
-    spheres: _Group
-    rotation: Tensor
-    translation: Tensor
-
-
-def solids_of(
-    scenes: Sequence[Scene], device: torch.device | str = "cpu", dtype: torch.dtype = torch.float64
-) -> Solids:
-    """Scenes as tensors.
-
-    Raises:
-        SettingError: for a scene that is not a room closed by one floor, four walls and a ceiling.
-    """
-    chosen: dict[str, list[list[tuple[int, Solid]]]] = {"boxes": [], "cylinders": [], "spheres": []}
-    rooms, faces, yaw, place = [], [], [], []
-    for scene in scenes:
-        parts: dict[str, list[tuple[int, Solid]]] = {name: [] for name in chosen}
-        shell = []
-        for geom, solid in enumerate(scene.solids):
-            if solid.kind in (FLOOR, ROOM):
-                shell.append((geom, solid))
-            else:
-                parts["boxes" if solid.shape == "box" else f"{solid.shape}s"].append((geom, solid))
-        ends, geoms = _closed(shell)
-        rooms.append(ends)
-        faces.append(geoms)
-        rotation, translation = scene.world_from_ego
-        yaw.append((float(rotation[0, 0]), float(rotation[1, 0])))
-        place.append(tuple(float(t) for t in translation))
-        for name, found in parts.items():
-            chosen[name].append(found)
-
-    def tensor(values: object) -> Tensor:
-        return torch.tensor(values, dtype=dtype, device=device)
-
-    low, high = tensor(rooms).permute(2, 1, 0).contiguous()
-    return Solids(
-        ((low + high) / 2)[..., None],
-        ((high - low) / 2)[..., None],
-        torch.tensor(faces, device=device).T.contiguous(),
-        boxes=_group(chosen["boxes"], tensor),
-        cylinders=_group(chosen["cylinders"], tensor),
-        spheres=_group(chosen["spheres"], tensor),
-        rotation=tensor(yaw).T[..., None].contiguous(),
-        translation=tensor(place).T[..., None].contiguous(),
-    )
-
-
-def take(solids: Solids, index: Tensor) -> Solids:
-    """Some of the scenes, each as often as an index (K,) names it."""
-
-    def some(part: Any) -> Any:
-        if isinstance(part, _Group):
-            return _Group(*(p.index_select(max(p.dim() - 3, 0), index) for p in part))
-        return part.index_select(1, index)
-
-    return Solids(*map(some, solids))
-
-
-def _closed(shell: list[tuple[int, Solid]]) -> tuple[list[list[float]], list[int]]:
-    """Where the room ends toward −x and x, −y and y, −z and z, and the geoms there, in that order."""
-    ends, faces = [[-math.inf, math.inf] for _ in range(3)], [-1] * 6
-    for geom, solid in shell:
-        axis = 2 if solid.shape == "plane" else min(range(3), key=lambda k: solid.size_m[k])
-        side = 0 if solid.shape == "plane" else int(solid.position_m[axis] > 0)
-        thick = 0.0 if solid.shape == "plane" else solid.size_m[axis]
-        require(faces[2 * axis + side] < 0 and solid.yaw_rad == 0, "scene", solid.name, "one wall on each side")
-        ends[axis][side] = solid.position_m[axis] + (thick, -thick)[side]
-        faces[2 * axis + side] = geom
-    require(min(faces) >= 0, "scene", f"{len(shell)} parts of a room", "a floor, four walls and a ceiling")
-    return ends, faces
-
-
-def _group(scenes: list[list[tuple[int, Solid]]], tensor: Callable[[object], Tensor]) -> _Group:
-    most = max(len(scene) for scene in scenes)
-    rows = []
-    for scene in scenes:
-        row = []
-        for geom, solid in scene:
-            size = (*solid.size_m, 0.0, 0.0)[:3]
-            yaw = torch.tensor(solid.yaw_rad, dtype=torch.float64)
-            row.append((*solid.position_m, *size, float(yaw.cos()), float(yaw.sin()), float(geom)))
-        # far below and without size
-        row += [(0.0, 0.0, -1e6, 0.0, 0.0, 0.0, 1.0, 0.0, -1.0)] * (most - len(row))
-        rows.append(row)
-    values = tensor(rows).reshape(len(scenes), most, 9).permute(2, 0, 1).contiguous()
-    return _Group(values[:3, ..., None], values[3:6, ..., None], values[6:8, ..., None], values[8].long())
+__all__ = ["occluded", "ranges", "trace"]
 
 
 class _Rays(NamedTuple):
@@ -175,18 +43,7 @@ class _Pairs(NamedTuple):
     exit: Tensor
 
 
-def _inverse(step: Tensor) -> Tensor:
-    tiny = _tiny(step.dtype)
-    return 1 / torch.where(step.abs() > tiny, step, torch.full_like(step, tiny))
-
-
-def _slab(middle: Tensor, half: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor]:
-    """Where rays enter and leave |x − middle| ≤ half; x advances by 1/inverse a unit of range."""
-    centre, reach = middle * inverse, half * inverse.abs()
-    return centre - reach, centre + reach
-
-
-def _near(group: _Group, rays: _Rays, unit: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _near(group: Group, rays: _Rays, unit: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The pairs of rays and solids worth an exact test: batch, flat solid and flat ray numbers, (P,) each.
 
     Near is a ray that passes a solid's bounding sphere, ahead. Single precision, with a margin, is enough for that.
@@ -207,7 +64,7 @@ def _near(group: _Group, rays: _Rays, unit: Tensor) -> tuple[Tensor, Tensor, Ten
 def _pairs(solids: Solids, rays: _Rays) -> list[_Pairs]:
     found = []
     unit = torch.stack([d.float() for d in rays.direction], -2)
-    for group, kind in ((solids.boxes, "box"), (solids.cylinders, "cylinder"), (solids.spheres, "sphere")):
+    for kind, group in solids.groups:
         if group.geom.shape[1] == 0:
             continue
         b, which, flat = _near(group, rays, unit)
@@ -215,37 +72,11 @@ def _pairs(solids: Solids, rays: _Rays) -> list[_Pairs]:
         cx, cy, cz, sx, sy, sz, c, s = (
             part.reshape(-1).index_select(0, which) for part in (*group.centre, *group.size, *group.turn)
         )
-        rx, ry, rz = (centre - o[:, 0].index_select(0, b) for centre, o in zip((cx, cy, cz), rays.origin, strict=True))
-        if kind == "box":
-            ends = [
-                _slab(c * rx + s * ry, sx, _inverse(c * dx + s * dy)),
-                _slab(c * ry - s * rx, sy, _inverse(c * dy - s * dx)),
-                _slab(rz, sz, _inverse(dz)),
-            ]
-        elif kind == "cylinder":
-            a = dx * dx + dy * dy
-            upright = a <= _tiny(a.dtype)  # along the axis: inside all the way, or nowhere
-            a, cross = torch.where(upright, torch.ones_like(a), a), dx * ry - dy * rx
-            middle = torch.where(upright, torch.zeros_like(a), (dx * rx + dy * ry) / a)
-            inside = torch.where(upright, sx * sx - rx * rx - ry * ry, sx * sx * a - cross * cross)
-            half = torch.where(upright, torch.full_like(a, torch.inf), inside.clamp(min=0).sqrt() / a)
-            ends = [(torch.where(inside >= 0, middle - half, torch.inf), middle + half), _slab(rz, sy, _inverse(dz))]
-        else:
-            along = dx * rx + dy * ry + dz * rz
-            inside = sx * sx - (rx * rx + ry * ry + rz * rz) + along * along
-            half = inside.clamp(min=0).sqrt()
-            ends = [(torch.where(inside >= 0, along - half, torch.inf), along + half)]
-        entry, leave = ends[0]
-        for low, high in ends[1:]:
-            entry, leave = torch.maximum(entry, low), torch.minimum(leave, high)
+        ox, oy, oz = (o[:, 0].index_select(0, b) for o in rays.origin)
+        offset = (cx - ox, cy - oy, cz - oz)
+        entry, leave = chord(kind, offset, (sx, sy, sz), (c, s), (dx, dy, dz))
         found.append(_Pairs(flat, group.geom.reshape(-1).index_select(0, which), entry, leave))
     return found
-
-
-def _first(entry: Tensor, leave: Tensor) -> Tensor:
-    """Range of the first surface: the entry, or from inside the exit; infinite where missed or behind."""
-    range_m = torch.where(entry > 0, entry, leave)
-    return torch.where((entry <= leave) & (leave > 0), range_m, torch.inf)
 
 
 def trace(solids: Solids, origin_e: Tensor, directions_e: Tensor) -> tuple[Tensor, Tensor]:
@@ -269,8 +100,8 @@ def trace(solids: Solids, origin_e: Tensor, directions_e: Tensor) -> tuple[Tenso
         geom = torch.where(leave[axis] <= range_m, torch.where(ahead > 0, face[1], face[0]), geom)
     geom = geom.reshape(-1)
     for pairs in met:
-        first = _first(pairs.entry, pairs.exit) == range_m.reshape(-1).index_select(0, pairs.ray)
-        geom[pairs.ray[first]] = pairs.geom[first]
+        met_first = first(pairs.entry, pairs.exit) == range_m.reshape(-1).index_select(0, pairs.ray)
+        geom[pairs.ray[met_first]] = pairs.geom[met_first]
     return range_m, geom.reshape(range_m.shape)
 
 
@@ -289,11 +120,11 @@ def _ranges(solids: Solids, origin_e: Tensor, directions_e: Tensor) -> tuple[Ten
     offset = [middle - o for middle, o in zip(solids.middle, rays.origin, strict=True)]
     inside = bool(torch.stack([h - o.abs() for h, o in zip(solids.half, offset, strict=True)]).amin() > 0)
     require(inside, "origin", "an eye outside of the room", "eyes inside")
-    leave = [_slab(o, h, _inverse(d))[1] for o, h, d in zip(offset, solids.half, rays.direction, strict=True)]
+    leave = [way_out(o, h, d) for o, h, d in zip(offset, solids.half, rays.direction, strict=True)]
     best = torch.minimum(torch.minimum(leave[0], leave[1]), leave[2])
     met = _pairs(solids, rays)
     for pairs in met:
-        best.view(-1).scatter_reduce_(0, pairs.ray, _first(pairs.entry, pairs.exit), "amin")
+        best.view(-1).scatter_reduce_(0, pairs.ray, first(pairs.entry, pairs.exit), "amin")
     return best, leave, rays, met
 
 
@@ -310,10 +141,10 @@ def occluded(solids: Solids, origin_e: Tensor, points_e: Tensor) -> Tensor:
     dtype = solids.rotation.dtype
     line = points_e.to(dtype) - origin_e.to(dtype)[:, None]
     away = (line * line).sum(-1).sqrt()
-    rays = _world(solids, origin_e, line / away.clamp(min=_tiny(dtype))[..., None])
+    rays = _world(solids, origin_e, line / away.clamp(min=tiny(dtype))[..., None])
     hidden = torch.zeros(away.numel(), dtype=torch.bool, device=away.device)
     # a point's own surface is met at the point itself, but for rounding at grazing incidence
     limit = (away - (1e-5 + 1e-5 * away)).reshape(-1)
     for ray, _, entry, leave in _pairs(solids, rays):
-        hidden[ray[_first(entry, leave) < limit.index_select(0, ray)]] = True
+        hidden[ray[first(entry, leave) < limit.index_select(0, ray)]] = True
     return hidden.reshape(away.shape)

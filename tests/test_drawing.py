@@ -1,0 +1,141 @@
+"""Pictures drawn as tensors are the pictures that MuJoCo's rays and NumPy draw, pixel by pixel."""
+
+import sys
+
+import first_pictures
+import numpy as np
+import pytest
+import torch
+
+from torchfovea.sensing.camera import Fisheye, Pinhole, image_camera
+from torchfovea.sensing.head import Gaze, Head, eyes
+from torchfovea.setting import SettingError
+from torchfovea.sim import volume
+from torchfovea.sim.drawing import draw_pictures, paint_scenes
+from torchfovea.sim.model import EgoPose
+from torchfovea.sim.rays import cast, render
+from torchfovea.sim.room import CAN
+from torchfovea.sim.scene import AttentionWorld, Cans, build_scene, stand_at
+
+SIZE = 100
+CAMERAS = [Pinhole.from_fov(135, 100), Pinhole.from_fov(40, 100), Fisheye.from_fov(220, 100)]
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    moved = stand_at(build_scene(AttentionWorld(), 1), EgoPose(0.2, -0.3, 0.7))
+    return [build_scene(Cans(), 5), moved]
+
+
+def pose_of(pan, tilt, vergence):
+    return eyes(Head(), Gaze(*(torch.tensor(a, dtype=torch.float64) for a in (pan, tilt, vergence))))
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=["wide", "narrow", "fisheye"])
+@pytest.mark.parametrize("gaze", [(0.0, 0.0, 0.0), (-0.7, 0.4, 0.3), (0.5, 0.6, 0.1)])
+def test_the_picture_that_rays_draw(scenes, camera, gaze):
+    camera, pose = image_camera(camera, 100, SIZE), pose_of(*gaze)
+    for scene in scenes:
+        image, hits = first_pictures.picture(scene, pose.R_left, pose.t_left, camera, SIZE)
+        frame = render(scene, pose.R_left, pose.t_left, camera, SIZE)
+        same = frame.geom == hits.geom.view(SIZE, SIZE)
+        # an edge may lie on either side of a pixel's centre
+        assert same.double().mean() > 0.9995
+        away = (frame.range_m.double() - hits.range_m.view(SIZE, SIZE)).abs()[same]
+        assert away.max() < 2e-5 and away.median() < 1e-6
+        turned = (frame.normal.double() - hits.normal.view(SIZE, SIZE, 3)).abs().amax(-1)[same]
+        assert turned.quantile(0.999) < 1e-4
+        error = (frame.image - image).abs().amax(0)[same]
+        # a two hundredth of white where a texture is cut off, nothing elsewhere
+        assert error.median() < 1e-4 and error.quantile(0.99) < 3e-3 and error.max() < 0.015
+
+
+def test_along_the_axes(scenes):
+    """The middle pixel looks exactly along an axis, level and straight down, beside and above cans."""
+    camera = image_camera(Pinhole.from_fov(90, 100), 100, 33)
+    level = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
+    down = torch.tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]], dtype=torch.float64).T
+    scene = scenes[0]
+    places = [torch.tensor(s.position_m, dtype=torch.float64) for s in scene.solids if s.kind == CAN]
+    index = torch.arange(33, dtype=torch.float64)
+    v, u = torch.meshgrid(index, index, indexing="ij")
+    rays = camera.rays(torch.stack([u, v], -1)).reshape(-1, 3)
+    for place in places:
+        eye = place + torch.tensor([0.0, 0.0, 0.4]) - torch.tensor([0.0, 0.0, scene.head.ego_height_m])
+        for R in (level, down):
+            frame = render(scene, R, eye, camera, 33)
+            hits = cast(scene, eye, rays @ R.T)
+            assert (frame.geom.view(-1) == hits.geom).double().mean() > 0.997
+            assert (frame.range_m.view(-1).double() - hits.range_m).abs().quantile(0.99) < 1e-5
+            assert torch.isfinite(frame.image).all()
+
+
+def test_together_is_alone(scenes):
+    """Scenes of other sizes, each with an eye of its own."""
+    camera, poses = image_camera(CAMERAS[0], 100, 52), [pose_of(0.0, 0.3, 0.2), pose_of(-0.4, 0.0, 0.1)]
+    chosen = [scenes[0], scenes[1], scenes[0]]
+    turns, places = [], []
+    for k, scene in enumerate(chosen):
+        rotation, translation = (torch.from_numpy(part) for part in scene.world_from_ego)
+        pose = poses[k % 2]
+        turns.append(rotation @ pose.R_right)
+        places.append(rotation @ pose.t_right + translation)
+    together = draw_pictures(paint_scenes(chosen), torch.stack(turns), torch.stack(places), camera, 52)
+    for k, scene in enumerate(chosen):
+        alone = render(scene, poses[k % 2].R_right, poses[k % 2].t_right, camera, 52)
+        assert torch.equal(together.geom[k], alone.geom)
+        assert torch.allclose(together.range_m[k], alone.range_m, atol=1e-6)
+        assert (together.image[k] - alone.image).abs().quantile(0.999) < 2e-3
+
+
+def test_with_and_without_opencv(scenes, monkeypatch):
+    camera, pose = image_camera(CAMERAS[0], 100, 64), pose_of(0.1, 0.2, 0.2)
+    images = []
+    for exact in (True, False):
+        monkeypatch.setattr(volume, "_exact", lambda exact=exact: exact)
+        images.append(render(scenes[0], pose.R_left, pose.t_left, camera, 64).image)
+    assert (images[0] - images[1]).abs().max() < 2e-3
+
+
+def test_a_volume_repeats():
+    """What OpenCV and PyTorch find is what NumPy finds, in any period."""
+    rng = np.random.default_rng(0)
+    values = rng.standard_normal((4, 8, 8, 8)).astype(np.float32)
+    lookup = volume.PeriodicVolume(values, torch.device("cpu"))
+    place = torch.from_numpy(rng.uniform(-2, 3, (3, 70, 64)).astype(np.float32))
+    x, y, z = (place.double().numpy() % 1) * 8
+    expected = np.zeros((4, 70, 64))
+    whole = [np.floor(part).astype(int) for part in (x, y, z)]
+    for corner in np.ndindex(2, 2, 2):
+        weight, index = 1.0, []
+        for part, low, step in zip((x, y, z), whole, corner, strict=True):
+            weight = weight * (1 - np.abs(part - low - step))
+            index.append((low + step) % 8)
+        expected += weight * values[:, index[2], index[1], index[0]]
+    assert np.abs(torch.stack(lookup.at(*place)).numpy() - expected).max() < 1e-3
+    unit = [part - part.floor() for part in place]
+    assert np.abs(torch.stack(lookup._by_torch(*unit)).numpy() - expected).max() < 1e-3
+
+
+def test_without_opencv_pytorch_looks_up(monkeypatch):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    volume._exact.cache_clear()
+    try:
+        assert not volume._exact()
+    finally:
+        volume._exact.cache_clear()
+
+
+def test_an_eye_outside_of_the_room_is_named(scenes):
+    with pytest.raises(SettingError, match="origin = an eye outside of the room"):
+        render(scenes[0], torch.eye(3), torch.tensor([50.0, 0.0, 0.0]), Pinhole(10.0), 8)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA here")
+def test_the_same_on_cuda(scenes):
+    camera, pose = image_camera(CAMERAS[0], 100, 64), pose_of(0.1, 0.2, 0.2)
+    here = render(scenes[0], pose.R_left, pose.t_left, camera, 64)
+    there = render(scenes[0], pose.R_left.cuda(), pose.t_left.cuda(), camera, 64)
+    assert there.image.device.type == "cuda"
+    assert (there.geom.cpu() == here.geom).double().mean() > 0.999
+    assert (there.image.cpu() - here.image).abs().quantile(0.99) < 3e-3

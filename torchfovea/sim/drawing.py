@@ -1,0 +1,303 @@
+"""Pictures of many scenes at once, as tensor operations on any device.
+
+A picture is cut into square tiles. A solid is tried only in the tiles whose cone of rays reaches into the azimuths and
+elevations that it spans, which every camera has; every ray leaves the room through the floor, a wall or the ceiling.
+Walls and shading are in single precision, which puts surfaces a few metres away within microns; the rest is in double.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchfovea.sensing.camera import Camera
+from torchfovea.sensing.chart import Components
+from torchfovea.setting import require
+from torchfovea.sim.model import Scene
+from torchfovea.sim.solids import (
+    Solids,
+    chord,
+    extent,
+    first,
+    outward,
+    solids_of,
+    way_out,
+)
+from torchfovea.sim.texture import Paint, colour
+
+__all__ = ["Drawn", "Painted", "draw_pictures", "paint_scenes"]
+
+_TILE = 8  # side [px]
+_AREA = _TILE * _TILE
+_FACES = 6  # a room's, the first surfaces of each scene
+_MARGIN_RAD = 1e-4  # of cones and spans, for rounding
+_SKY = (0.62, 0.72, 0.82)
+_STEEPEST = 0.12  # cosine of the slant at which the footprint stops growing
+
+
+class Painted(NamedTuple):
+    """B scenes, in double precision, and what they look like, in single.
+
+    Attributes:
+        solids: of the scenes.
+        geom: of each surface, int64 (B · S,): the faces of the room, the boxes, cylinders and spheres; -1 for none.
+        paint: of each surface.
+    """
+
+    solids: Solids
+    geom: Tensor
+    paint: Paint
+
+
+class Drawn(NamedTuple):
+    """B pictures and the truth behind them.
+
+    Attributes:
+        image: (B, 3, H, W) RGB in [0, 1].
+        range_m: (B, H, W) along each pixel's ray, infinite where it meets nothing.
+        geom: (B, H, W) int64, -1 for a miss.
+        normal: (B, 3, H, W) in the world.
+    """
+
+    image: Tensor
+    range_m: Tensor
+    geom: Tensor
+    normal: Tensor
+
+
+class _Pixels(NamedTuple):
+    """What a camera's pixels see, tile by tile.
+
+    Attributes:
+        ray: unit, by component, float64 (3, T, 64).
+        single: the same in float32.
+        span: the angle that a pixel spans [rad], (T, 64).
+        axis: of the cone around a tile's rays, float64 (T, 3).
+        cone: half its angle [rad], float64 (T,).
+    """
+
+    ray: Tensor
+    single: Tensor
+    span: Tensor
+    axis: Tensor
+    cone: Tensor
+
+
+def paint_scenes(scenes: Sequence[Scene], device: torch.device | str = "cpu") -> Painted:
+    """Scenes to draw, closed rooms or not."""
+    solids = solids_of(scenes, device, closed=False)
+    geom = torch.cat([solids.faces.T, *(group.geom for _, group in solids.groups)], 1)
+    tables = []
+    for scene, own in zip(scenes, geom.cpu().clamp(min=0), strict=True):
+        tables.append(Paint(*(part[:, own] for part in scene.paint)))
+    paint = Paint(*(torch.cat(parts, 1).to(device) for parts in zip(*tables, strict=True)))
+    return Painted(solids, geom.reshape(-1), paint)
+
+
+@lru_cache(maxsize=8)
+def _pixels(camera: Camera, size_px: int, device: torch.device) -> _Pixels:
+    side = -(-size_px // _TILE)
+    # past the edge, the edge's pixels again
+    index = torch.arange(side * _TILE, dtype=torch.float64).clamp(max=size_px - 1)
+    v, u = torch.meshgrid(index, index, indexing="ij")
+
+    def tiled(part: Tensor) -> Tensor:
+        return part.reshape(side, _TILE, side, _TILE).transpose(1, 2).reshape(-1, _AREA)
+
+    px = torch.stack([tiled(u), tiled(v)], -1)
+    ray = torch.nn.functional.normalize(camera.rays(px), dim=-1)
+    spans = []
+    for step in ((0.5, 0.0), (0.0, 0.5)):
+        shift = torch.tensor(step, dtype=torch.float64)
+        ends = [torch.nn.functional.normalize(camera.rays(px + s * shift), dim=-1) for s in (-1, 1)]
+        spans.append((ends[1] - ends[0]).norm(dim=-1))
+    axis = torch.nn.functional.normalize(ray.mean(1), dim=-1)
+    cone = 2 * torch.asin(((ray - axis[:, None]).norm(dim=-1).amax(1) / 2).clamp(max=1)) + _MARGIN_RAD
+    ray = ray.permute(2, 0, 1).contiguous()
+    parts = (ray, ray.float(), torch.maximum(*spans).float(), axis, cone)
+    return _Pixels(*(part.to(device) for part in parts))
+
+
+def _reached(shape: str, size: Tensor, offset: Tensor, axis: Tensor, cone: Tensor) -> Tensor:
+    """Whether tiles may see solids, bool (K, B, T).
+
+    Args:
+        shape: of the solids.
+        size: of each, (3, B, K).
+        offset: from the eyes to their centres, (3, B, K).
+        axis: of the tiles' cones, (B, T, 3).
+        cone: half their angles [rad], (T,).
+    """
+    x, y, z = offset
+    (radius, half), away = extent(shape, size), torch.hypot(x, y)
+    # how far a solid and a tile reach to either side; all around where they are above, below or around
+    wide = torch.asin((radius / away).clamp(max=1)) + torch.where(away <= radius, math.pi, _MARGIN_RAD)
+    up = torch.asin(axis[..., 2].clamp(-1, 1))
+    side = torch.where(up.abs() + cone < math.pi / 2, cone.sin() / up.cos(), 2.0)
+    side = torch.where(side < 1, torch.asin(side.clamp(max=1)), math.pi)
+    turn = torch.atan2(y, x).T[..., None] - torch.atan2(axis[..., 1], axis[..., 0])
+    beside = (torch.remainder(turn + math.pi, 2 * math.pi) - math.pi).abs() <= wide.T[..., None] + side
+    near, far = (away - radius).clamp(min=0), away + radius
+    top, bottom = z + half, z - half
+    highest = torch.atan2(top, torch.where(top > 0, near, far)).T[..., None] + _MARGIN_RAD
+    lowest = torch.atan2(bottom, torch.where(bottom > 0, far, near)).T[..., None] - _MARGIN_RAD
+    return beside & (up - cone <= highest) & (up + cone >= lowest)
+
+
+class _Met(NamedTuple):
+    """First surfaces on the rays of rows of pixels, (R, 64): range [m], and int32 which of the scene's they are."""
+
+    range_m: Tensor
+    surface: Tensor
+
+
+def _walls(solids: Solids, eye: Tensor, direction: Components) -> _Met:
+    """Where rays (B · T, 64) leave their room, each eye (B, 3) being inside."""
+    offset = solids.middle[..., 0] - eye.T
+    inside = bool(((solids.half[..., 0] - offset.abs()) > 0).all())
+    require(inside, "origin", "an eye outside of the room", "eyes inside")
+    rows = len(direction[0]) // len(eye)
+    out = [
+        way_out(o.repeat_interleave(rows)[:, None], h.repeat_interleave(rows)[:, None], d)
+        for o, h, d in zip(offset.float(), solids.half[..., 0].float(), direction, strict=True)
+    ]
+    best = torch.minimum(torch.minimum(out[0], out[1]), out[2])
+    face = (direction[2] > 0).int().add_(4)
+    for axis in (1, 0):  # arithmetic: torch.where is slow here
+        own = (direction[axis] > 0).int().add_(2 * axis)
+        face.add_((out[axis] <= best).int().mul_(own.sub_(face)))
+    return _Met(best, face)
+
+
+def _stand_before(
+    met: _Met, solids: Solids, eye: Tensor, rotation: Tensor, pixels: _Pixels, near: Sequence[Tensor]
+) -> None:
+    """Put what stands in the rooms before their walls, in place.
+
+    Args:
+        met: the walls, (B · T, 64).
+        solids: of the scenes.
+        eye: in the worlds, float64 (B, 3).
+        rotation: of the cameras, float64 (B, 3, 3).
+        pixels: what they see.
+        near: of each shape, see `_reached`.
+    """
+    place = _FACES
+    for (shape, group), reached in zip(solids.groups, near, strict=True):
+        count, _, tiles = reached.shape
+        which, batch, tile = reached.nonzero().unbind(1)
+        row, own = batch * tiles + tile, batch * count + which
+        # in double precision: a ray that grazes a cylinder magnifies rounding a thousandfold
+        x, y, z = (part.index_select(0, tile) for part in pixels.ray)
+        dx, dy, dz = ((x * a).addcmul_(y, b).addcmul_(z, c) for a, b, c in rotation[batch].permute(1, 2, 0)[..., None])
+        rx, ry, rz = (part.reshape(-1)[own, None] for part in group.centre[..., 0] - eye.T[:, :, None])
+        (sx, sy, sz), (c, s) = (part.flatten(1)[:, own, None].unbind(0) for part in (group.size, group.turn))
+        range_m = first(*chord(shape, (rx, ry, rz), (sx, sy, sz), (c, s), (dx, dy, dz))).float()
+        # one solid after the other: no two of its pairs are of one tile
+        ends = which.bincount(minlength=count).tolist()
+        for number, (rows, found) in enumerate(zip(row.split(ends), range_m.split(ends), strict=True)):
+            if len(rows) == 0:
+                continue
+            before, surface = met.range_m.index_select(0, rows), met.surface.index_select(0, rows)
+            surface.add_((found < before).int().mul_(place + number - surface))
+            met.surface.index_copy_(0, rows, surface)
+            met.range_m.index_copy_(0, rows, torch.minimum(found, before))
+        place += count
+
+
+def _normals(met: _Met, solids: Solids, eye: Tensor, direction: Components, near: Sequence[Tensor]) -> list[Tensor]:
+    """Of the first surfaces, by component (B · T, 64): into the room, or out of what stands in it.
+
+    Args:
+        met: the first surfaces.
+        solids: of the scenes.
+        eye: in the worlds, (B, 3).
+        direction: of the rays, (B · T, 64).
+        near: of each shape, see `_reached`.
+    """
+    inward = torch.zeros(3, _FACES + sum(len(reached) for reached in near)).to(met.range_m)
+    for axis in range(3):
+        inward[axis, 2 * axis], inward[axis, 2 * axis + 1] = 1, -1
+    which = met.surface.view(-1)
+    normal = [part.index_select(0, which).view_as(met.range_m) for part in inward]
+    place = _FACES
+    for (shape, group), reached in zip(solids.groups, near, strict=True):
+        count, _, tiles = reached.shape
+        rows = reached.any(0).view(-1).nonzero()[:, 0]
+        if len(rows) > 0:
+            number = met.surface.index_select(0, rows).sub_(place)
+            mine = (number >= 0) & (number < count)
+            own = number.clamp_(0, count - 1).add_((rows // tiles * count).int()[:, None]).view(-1)
+            offset = group.centre[..., 0] - eye.T[:, :, None]
+            # of each pixel, what its solid is like
+            px, py, pz, sx, sy, sz, c, s = (
+                table.float().reshape(-1).index_select(0, own).view_as(mine)
+                for table in (*offset, *group.size, *group.turn)
+            )
+            away = met.range_m.index_select(0, rows)
+            dx, dy, dz = (d.index_select(0, rows).mul_(away) for d in direction)
+            out = outward(shape, (dx - px, dy - py, dz - pz), (sx, sy, sz), (c, s))
+            for part, found in zip(normal, out, strict=True):
+                part.index_copy_(0, rows, torch.where(mine, found, part.index_select(0, rows)))
+        place += count
+    return normal
+
+
+@torch.no_grad()
+def draw_pictures(scenes: Painted, rotation: Tensor, eye: Tensor, camera: Camera, size_px: int) -> Drawn:
+    """Square pictures, one of each scene. Not differentiable.
+
+    Args:
+        scenes: B.
+        rotation: (B, 3, 3), columns are the cameras' axes in the worlds.
+        eye: (B, 3), where they are in the worlds [m].
+        camera: of all pictures; pixel centres are integers.
+        size_px: side of each.
+
+    Raises:
+        SettingError: for an eye outside of its room.
+    """
+    solids, device = scenes.solids, scenes.geom.device
+    pixels = _pixels(camera, size_px, device)
+    count, tiles = len(eye), len(pixels.axis)
+    rotation, eye = rotation.to(device, torch.float64), eye.to(device, torch.float64)
+    turned = rotation.float().transpose(0, 1).reshape(-1, 3) @ pixels.single.view(3, -1)
+    dx, dy, dz = turned.view(3, count * tiles, _AREA)
+    direction = (dx, dy, dz)
+    axis = pixels.axis @ rotation.mT
+    met = _walls(solids, eye, direction)
+    near = [
+        _reached(shape, group.size[..., 0], group.centre[..., 0] - eye.T[:, :, None], axis, pixels.cone)
+        for shape, group in solids.groups
+    ]
+    _stand_before(met, solids, eye, rotation, pixels, near)
+    nx, ny, nz = _normals(met, solids, eye, direction, near)
+    slant = (dx * nx).addcmul_(dy, ny).addcmul_(dz, nz).abs_().clamp_(min=_STEEPEST)
+    span = pixels.span.repeat(count, 1) if count > 1 else pixels.span
+    at = eye.float().repeat_interleave(tiles, 0)
+    x, y, z = (torch.addcmul(at[:, k, None], d, met.range_m) for k, d in enumerate(direction))
+    if count > 1:
+        own = torch.arange(count, device=device, dtype=torch.int32) * (len(scenes.geom) // count)
+        met.surface.add_(own.repeat_interleave(tiles)[:, None])
+    rgb = colour(scenes.paint, met.surface, (x, y, z), (nx, ny, nz), met.range_m * span / slant)
+    geom = scenes.geom.index_select(0, met.surface.view(-1)).view_as(met.surface)
+    if bool((scenes.geom[:_FACES] < 0).any()):
+        missed = geom < 0
+        rgb = torch.where(missed, rgb.new_tensor(_SKY)[:, None, None], rgb)
+        nx, ny, nz = (part.masked_fill(missed, 0) for part in (nx, ny, nz))
+        met.range_m.masked_fill_(missed, torch.inf)
+
+    side = -(-size_px // _TILE)
+
+    def whole(part: Tensor) -> Tensor:  # (..., B · T, 64) to (B, ..., H, W)
+        lead = part.shape[:-2]
+        part = part.view(*lead, count, side, side, _TILE, _TILE).transpose(-2, -3)
+        part = part.reshape(*lead, count, side * _TILE, side * _TILE)[..., :size_px, :size_px]
+        return part.movedim(-3, 0).contiguous()
+
+    return Drawn(whole(rgb), whole(met.range_m), whole(geom), whole(torch.stack([nx, ny, nz])))
