@@ -9,6 +9,8 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 import pytest
 import torch
 from hypothesis import settings
+from legible import faults
+from matplotlib.figure import Figure
 
 # The same examples on every run, and no deadline: a shared machine stalls now and then.
 settings.register_profile("torchfovea", derandomize=True, deadline=None, database=None)
@@ -25,3 +27,17 @@ def dtype(request):
 def generator():
     """A seeded source of random numbers."""
     return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture(autouse=True)
+def every_picture_is_legible(monkeypatch):
+    """Whatever picture a test makes has names and units, writing of some size, and colours that all eyes tell apart."""
+    found, save = [], Figure.savefig
+
+    def looked_at(figure, *given, **options):
+        save(figure, *given, **options)
+        found.extend(faults(figure))
+
+    monkeypatch.setattr(Figure, "savefig", looked_at)
+    yield
+    assert not found, "\n".join(dict.fromkeys(found))

@@ -9,6 +9,7 @@ import matplotlib
 import numpy as np
 from torch import Tensor
 
+from torchfovea.commands.shared.pictures import PALETTE
 from torchfovea.files import write_figure
 from torchfovea.metrics import coverage
 from torchfovea.studies.calibration import Judged
@@ -19,7 +20,6 @@ from matplotlib.figure import Figure
 
 __all__ = ["draw_calibration"]
 
-COLOURS = ("tab:orange", "tab:blue", "tab:green")
 NOMINAL = np.concatenate([np.linspace(0.02, 0.98, 49), [0.99, 0.995]])
 REMOVED = np.linspace(0, 0.98, 99)
 
@@ -31,14 +31,14 @@ def draw_calibration(path: Path, data: Mapping[str, tuple[Judged, Mapping[str, T
         path: the PNG to write.
         data: by kind of data, a row each: the observations, and by model the claimed σ (N,) [1/m].
     """
-    figure = Figure(figsize=(16, 5 * len(data)), layout="constrained")
+    figure = Figure(figsize=(14, 4.5 * len(data)), layout="constrained")
     for row, (kind, (judged, models)) in zip(figure.subplots(len(data), 3, squeeze=False), data.items(), strict=True):
         error = judged.error.double()
         reliability, histogram, sparse = row
         reliability.plot([0, 1], [0, 1], color="0.5", ls=":", lw=1)
         size = np.asarray(error.abs())
         _curve(sparse, size, size, "0.5", "by the error itself")
-        for colour, (model, sigma) in zip(COLOURS, models.items(), strict=False):
+        for colour, (model, sigma) in zip(PALETTE, models.items(), strict=False):
             z = error / sigma.double()
             reliability.plot(NOMINAL, np.asarray(coverage(z, NOMINAL.tolist())), color=colour, label=model)
             histogram.hist(
@@ -59,7 +59,7 @@ def draw_calibration(path: Path, data: Mapping[str, tuple[Judged, Mapping[str, T
         for axes in row:
             axes.grid(alpha=0.3)
             axes.legend(fontsize=8)
-    write_figure(path, figure, dpi=80)
+    write_figure(path, figure, dpi=100)
 
 
 def _curve(axes: Axes, size: np.ndarray, uncertainty: np.ndarray, colour: str, label: str) -> None:

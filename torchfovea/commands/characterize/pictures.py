@@ -42,7 +42,7 @@ def draw_layouts(path: Path, retinas: Mapping[str, Retina], sigma_over_width: fl
         retinas: by title.
         sigma_over_width: standard deviation over width.
     """
-    figure = Figure(figsize=(6.2 * len(retinas), 6.6), layout="constrained")
+    figure = Figure(figsize=(5 * len(retinas), 5.4), layout="constrained")
     for axes, (title, retina) in zip(figure.subplots(1, len(retinas), squeeze=False)[0], retinas.items(), strict=True):
         px = retina.centers_px(dtype=torch.float64)
         across = 6 * sigma_over_width * np.asarray(retina.width_px(px))
@@ -81,7 +81,7 @@ def _curves(axes: Axes, grids: Mapping[str, Characterization], over: str) -> Non
     axes.set_ylabel("mean information over matched RFs [nats]")
     axes.grid(alpha=0.3)
     title = "vergence" if over == "distance" else "distance"
-    axes.legend(title=title, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    axes.legend(title=title, fontsize=9, loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
 def draw_fig5(path: Path, grids: Mapping[str, Characterization], baseline_m: float, title: str) -> None:
@@ -93,7 +93,7 @@ def draw_fig5(path: Path, grids: Mapping[str, Characterization], baseline_m: flo
         baseline_m: for the curve of matched vergences.
         title: the headline.
     """
-    figure = Figure(figsize=(17, 11), layout="constrained")
+    figure = Figure(figsize=(15, 9.8), layout="constrained")
     figure.suptitle(title, fontsize=14)
     above, below = figure.subfigures(2, 1, squeeze=False)[:, 0]
     a, b = above.subplots(1, 2)
@@ -127,7 +127,7 @@ def draw_fig5(path: Path, grids: Mapping[str, Characterization], baseline_m: flo
         axes.set(xlabel="distance [m]", title=name, ylim=(vergence[0], vergence[-1]))
         below.colorbar(drawn, ax=axes, pad=0.015)
     below.axes[0].set_ylabel("vergence [°] (dotted: axes meet on the plane)")
-    write_figure(path, figure, dpi=80)
+    write_figure(path, figure, dpi=100)
 
 
 def draw_advantage(path: Path, distance_m: Tensor, rows: Mapping[str, tuple[Sequence[float], Sequence[float]]]) -> None:
@@ -166,7 +166,7 @@ def draw_propagation(
     charts = list(dict.fromkeys(chart for chart, _ in worst))
     ways = list(dict.fromkeys(way for _, way in worst))
     names = ("range variance (relative)", "covariance (whitened Frobenius/√3)", "mean [standard deviations]")
-    figure = Figure(figsize=(16, 4.6 * len(charts)), layout="constrained")
+    figure = Figure(figsize=(14, 4.2 * len(charts)), layout="constrained")
     panels = figure.subplots(len(charts), 3, squeeze=False)
     for row, chart in zip(panels, charts, strict=True):
         for k, axes in enumerate(row):
@@ -179,7 +179,7 @@ def draw_propagation(
             axes.grid(alpha=0.3, which="both")
         row[0].set_ylabel("worst error against Monte Carlo")
     panels[0, 0].legend(fontsize=8)
-    write_figure(path, figure, dpi=80)
+    write_figure(path, figure, dpi=100)
 
 
 def draw_realised(
@@ -194,7 +194,7 @@ def draw_realised(
         title: the headline.
     """
     sizes = sorted({size for _, size in rings})
-    figure = Figure(figsize=(5.4 * len(sizes), 5.2), layout="constrained")
+    figure = Figure(figsize=(min(5.4 * len(sizes), 15), 5.2), layout="constrained")
     figure.suptitle(title)
     place = np.arange(len(edges_deg) - 1)
     labels = [f"{low:.3g}-{high:.3g}" for low, high in pairwise(edges_deg)]
@@ -214,5 +214,5 @@ def draw_realised(
         axes.set_xticks(place, labels)
         axes.grid(alpha=0.3, which="both")
     figure.axes[0].set_ylabel("median |range error| [mm]")
-    figure.axes[-1].legend(fontsize=8)
+    figure.axes[-1].legend(fontsize=9)
     write_figure(path, figure, dpi=90)

@@ -27,7 +27,7 @@ def draw_memory(path: Path, cells: Tensor, spacing_deg: Tensor, target: Tensor, 
         target: unit direction of the target (3,).
         title: the headline.
     """
-    figure = Figure(figsize=(17, 7.5), layout="constrained")
+    figure = Figure(figsize=(14, 6.4), layout="constrained")
     figure.suptitle(title, fontsize=15)
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.7))
     ahead = torch.nn.functional.normalize(torch.tensor([1.0, 0.25, 0.25], dtype=torch.float64), dim=0)
@@ -52,4 +52,4 @@ def draw_memory(path: Path, cells: Tensor, spacing_deg: Tensor, target: Tensor, 
     azimuth, elevation = torch.atan2(target[1], target[0]).rad2deg(), target[2].asin().rad2deg()
     right.plot(float(azimuth), float(elevation), "o", mfc="none", mec="crimson", ms=14, mew=2)
     right.set_title("cells within the head's reach; the target in red")
-    write_figure(path, figure, dpi=80)
+    write_figure(path, figure, dpi=100)

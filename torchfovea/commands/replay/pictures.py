@@ -43,7 +43,7 @@ def draw_replay(
         rows: of fixations.csv.
         retina: of both eyes.
     """
-    figure = Figure(figsize=(19, 11), layout="constrained")
+    figure = Figure(figsize=(15, 8.8), layout="constrained")
     figure.suptitle(f"{len(rows)} frames", fontsize=15)
     top, bottom = figure.subfigures(2, 1, squeeze=False)[:, 0]
     if look is not None and look.look is not None:
@@ -74,7 +74,7 @@ def draw_replay(
     right.plot(pan, -tilt, ".-", color="black", lw=0.8)
     for axes in (left, right):
         axes.set_facecolor("0.9")
-    write_figure(path, figure, dpi=80)
+    write_figure(path, figure, dpi=100)
 
 
 def _in_colour(axes: Axes, cells: Tensor, colours: Tensor) -> None:

@@ -48,7 +48,7 @@ def _scan_path(axes: Axes, episode: Episode) -> None:
             (azimuth[k], elevation[k]),
             textcoords="offset points",
             xytext=(5, 4),
-            fontsize=8,
+            fontsize=9,
             color="white",
             bbox={"boxstyle": "round,pad=0.12", "fc": DARK, "ec": "none", "alpha": 0.75},
         )
@@ -65,7 +65,7 @@ def draw_episode(path: Path, episode: Episode, retina: Retina, title: str) -> No
     """
     shown = episode.look.pictures
     rows = ([1.0] if shown is not None else []) + [1.0, 0.62]
-    figure = Figure(figsize=(19, 5.6 * sum(rows)), layout="constrained")
+    figure = Figure(figsize=(15, 4.5 * sum(rows)), layout="constrained")
     figure.suptitle(title, fontsize=15)
     parts = iter(figure.subfigures(len(rows), 1, height_ratios=rows, squeeze=False)[:, 0])
     if shown is not None:
@@ -117,4 +117,4 @@ def draw_episode(path: Path, episode: Episode, retina: Retina, title: str) -> No
     for axes in row:
         axes.set_xlabel("fixation t")
         axes.grid(alpha=0.3)
-    write_figure(path, figure, dpi=80)
+    write_figure(path, figure, dpi=100)

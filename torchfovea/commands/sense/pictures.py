@@ -36,7 +36,7 @@ def draw_sense(path: Path, left: Tensor, found: Any, retina: Retina | None, obse
         observed: in inverse range.
         px: the receptive fields, (N, 2), for the two maps.
     """
-    figure = Figure(figsize=(17, 9.5), layout="constrained")
+    figure = Figure(figsize=(14, 8), layout="constrained")
     axes = figure.subplots(2, 2)
     step = max(1, max(left.shape[-2:]) // SHOWN_PX)  # as fine as it is drawn
     height, width = left.shape[-2:]
@@ -48,15 +48,15 @@ def draw_sense(path: Path, left: Tensor, found: Any, retina: Retina | None, obse
         step = max(1, max(values.shape) // SHOWN_PX)
         inner = np.nanquantile(values, (0.02, 0.98)) if np.isfinite(values).any() else (0.0, 1.0)  # false matches apart
         drawn = axes[0, 1].imshow(values[::step, ::step], cmap="viridis", vmin=inner[0], vmax=inner[1])
-        figure.colorbar(drawn, ax=axes[0, 1], extend="both")
-        axes[0, 1].set_title(name)
+        figure.colorbar(drawn, ax=axes[0, 1], extend="both", label=name)
+        axes[0, 1].set(title="what the matcher found", xticks=[], yticks=[])
     keep = observed.valid & (observed.mean[:, 2] > 0)
     rho, sigma = observed.mean[keep, 2], observed.cov[keep, 5].sqrt()
     maps = (
-        (1 / rho, "range", "m", "viridis_r", False),
-        (sigma / rho, "standard deviation of the inverse range over itself", "", "magma", True),
+        (1 / rho, "range", "range [m]", "viridis_r", False),
+        (sigma / rho, "how surely it is known", "relative standard deviation of inverse range", "magma", True),
     )
-    for place, (value, name, unit, cmap, log) in zip(axes[1], maps, strict=True):
+    for place, (value, name, label, cmap, log) in zip(axes[1], maps, strict=True):
         low, high = (
             (float(q) for q in torch.quantile(value.double(), torch.tensor([0.02, 0.98], dtype=torch.float64)))
             if len(value)
@@ -68,5 +68,5 @@ def draw_sense(path: Path, left: Tensor, found: Any, retina: Retina | None, obse
         drawn.set_clim(low, max(high, low * 1.001 + 1e-9))
         place.set(title=name, aspect="equal", facecolor="0.9", xlabel="column [px]", ylabel="row [px]")
         place.invert_yaxis()
-        figure.colorbar(drawn, ax=place, label=unit)
-    write_figure(path, figure, dpi=80)
+        figure.colorbar(drawn, ax=place, label=label)
+    write_figure(path, figure, dpi=100)

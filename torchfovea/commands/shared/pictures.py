@@ -24,9 +24,12 @@ matplotlib.use("Agg")
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.ticker import MaxNLocator
 
-__all__ = ["azimuth_elevation", "draw_glance", "draw_precision", "found_map", "sphere_map"]
+__all__ = ["PALETTE", "azimuth_elevation", "draw_glance", "draw_precision", "found_map", "sphere_map"]
 
+# after Okabe and Ito: told apart by every eye
+PALETTE = ("#0072B2", "#D55E00", "#009E73", "#E69F00", "#56B4E9", "#CC79A7", "#000000")
 VIEW = {"elev": 16.0, "azim": -68.0}  # from behind the eyes, above and to the right of them
 MOST = 40_000  # points of a cloud that are drawn
 
@@ -111,6 +114,7 @@ def draw_glance(glance: Glance, path: Tensor, nats: Sequence[float], retina: Ret
             axes.plot(*map(float, place), "o", mfc="none", mec="tab:orange", ms=13, mew=2.2)
     wide[2].plot(range(1, len(nats) + 1), nats, ".-", color="tab:purple")
     wide[2].set(xlabel="fixation", ylabel="mean information [nats]")
+    wide[2].xaxis.set_major_locator(MaxNLocator(integer=True))
     wide[2].grid(alpha=0.3)
     return figure
 

@@ -6,6 +6,7 @@ import base64
 import html
 import io
 import json
+import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -91,7 +92,9 @@ def frames(film: Path | None, page: Path | None, observer: Observer) -> Iterator
         point = gaze_point(observer.head, glance.move.gaze).double().cpu()
         path.append(torch.nn.functional.normalize(point, dim=-1))
         nats.append(float(global_information(glance.step.points.cov)))
-        line = f"fixation {t + 1}: the eyes meet at {float(point.norm()):.2f} m"
+        away = float(point.norm())
+        where = f"meet at {away:.2f} m" if math.isfinite(away) else "look straight ahead, side by side"
+        line = f"fixation {t + 1}: the eyes {where}"
         figure = draw_glance(glance, torch.stack(path), nats, observer.retina, line)
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=DPI)

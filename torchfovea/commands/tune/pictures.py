@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchfovea.commands.shared.pictures import PALETTE
 from torchfovea.files import write_figure
 from torchfovea.tuning.bias import log_density_each, log_normalizer_each, reachable
 from torchfovea.tuning.problem import Problem
@@ -102,18 +104,18 @@ def draw_gradients(path: Path, checks: Sequence[dict[str, Any]]) -> None:
     """Each number's derivative, point by point: central differences beside the estimates."""
     points = list(dict.fromkeys(check["point"] for check in checks))
     size = len(checks[0]["difference"])
-    figure = Figure(figsize=(max(7.6, 0.35 * size), 2.6 * len(points)), layout="constrained")
+    figure = Figure(figsize=(min(max(7.6, 0.35 * size), 14), 2.6 * len(points)), layout="constrained")
     for ax, point in zip(np.atleast_1d(figure.subplots(len(points), 1, sharex=True)), points, strict=True):
         here = [check for check in checks if check["point"] == point]
         bars = [("central differences", "0.6", here[0]["difference"])]
-        for k, check in enumerate(here):
-            bars.append((f"{check['estimator']}, cosine {check['cosine']:.2f}", f"C{k}", check["estimate"]))
+        for colour, check in zip(cycle(PALETTE), here, strict=False):
+            bars.append((f"{check['estimator']}, cosine {check['cosine']:.2f}", colour, check["estimate"]))
         width = 0.8 / len(bars)
         for k, (label, colour, values) in enumerate(bars):
             ax.bar(np.arange(size) + (k - (len(bars) - 1) / 2) * width, values, width, color=colour, label=label)
         ax.axhline(0, color="0.2", lw=0.6)
         ax.set(title=f"at {point}", ylabel="derivative")
-        ax.legend(frameon=False, fontsize="x-small", ncols=2)
+        ax.legend(frameon=False, fontsize="small", ncols=2)
     ax.set_xlabel("number of the vector")
     write_figure(path, figure, dpi=130)
 
@@ -124,8 +126,8 @@ def draw_curves(path: Path, rows: Sequence[Row]) -> None:
     ax = figure.subplots()
     for k, (method, by_budget) in enumerate(mean_curves(rows).items()):
         mean, low, high = np.array([student(values) for values in by_budget.values()]).T
-        budgets, colour = list(by_budget), f"C{k % 10}"
-        ax.plot(budgets, mean, "o-", ms=3.5, color=colour, label=method.replace("_", " "))
+        budgets, colour, dots = list(by_budget), PALETTE[k % len(PALETTE)], "o-" if k < len(PALETTE) else "s--"
+        ax.plot(budgets, mean, dots, ms=3.5, color=colour, label=method.replace("_", " "))
         ax.fill_between(budgets, low, high, color=colour, alpha=0.15, lw=0)
     ax.set(xscale="log", xlabel="simulated episodes, counterfactual runs included", ylabel="held-out gap per saccade")
     ax.legend(frameon=False, ncols=2)
