@@ -36,8 +36,9 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
 
 
 def on_page_markdown(markdown: str, **_: object) -> str:
-    """Lead to the site's own page of an example."""
-    return re.sub(r"\]\((?:\.\./)*examples/(\w+)\.(?:py|ipynb)\)", r"](examples/\1.md)", markdown)
+    """Lead to the site's own page of an example, and from a picture to itself at full size."""
+    markdown = re.sub(r"\]\((?:\.\./)*examples/(\w+)\.(?:py|ipynb)\)", r"](examples/\1.md)", markdown)
+    return re.sub(r"^(!\[[^]]+\]\(([^)]+)\))$", r"[\1](\2)", markdown, flags=re.MULTILINE)
 
 
 def examples() -> list[Path]:
