@@ -1,6 +1,7 @@
 """Pictures drawn as tensors are the pictures that MuJoCo's rays and NumPy draw, pixel by pixel."""
 
 import sys
+from functools import partial
 
 import first_pictures
 import numpy as np
@@ -16,6 +17,7 @@ from torchfovea.sim.model import EgoPose
 from torchfovea.sim.rays import cast, render
 from torchfovea.sim.room import CAN
 from torchfovea.sim.scene import AttentionWorld, Cans, build_scene, stand_at
+from torchfovea.sim.world import World
 
 SIZE = 100
 CAMERAS = [Pinhole.from_fov(135, 100), Pinhole.from_fov(40, 100), Fisheye.from_fov(220, 100)]
@@ -86,6 +88,19 @@ def test_together_is_alone(scenes):
         assert torch.equal(together.geom[k], alone.geom)
         assert torch.allclose(together.range_m[k], alone.range_m, atol=1e-6)
         assert (together.image[k] - alone.image).abs().quantile(0.999) < 2e-3
+
+
+def test_both_eyes_are_drawn_at_once(scenes):
+    """As a configuration names the renderer, and as a function of one's own that calls it for each eye."""
+    gaze = Gaze(*(torch.tensor(a, dtype=torch.float64) for a in (0.2, 0.1, 0.3)))
+    named, each = (
+        World(scenes[1], renderer=renderer, source_px=52).images(gaze)
+        for renderer in (partial(render), lambda *given: render(*given))
+    )
+    for a, b in zip(named, each, strict=True):
+        assert torch.equal(a.geom, b.geom)
+        assert (a.image - b.image).abs().quantile(0.999) < 2e-3
+        assert (a.normal - b.normal).abs().quantile(0.999) < 1e-4
 
 
 def test_with_and_without_opencv(scenes, monkeypatch):

@@ -123,30 +123,34 @@ def _pixels(camera: Camera, size_px: int, device: torch.device) -> _Pixels:
     return _Pixels(*(part.to(device) for part in parts))
 
 
-def _reached(shape: str, size: Tensor, offset: Tensor, axis: Tensor, cone: Tensor) -> Tensor:
-    """Whether tiles may see solids, bool (K, B, T).
+def _reached(solids: Solids, eye: Tensor, axis: Tensor, cone: Tensor) -> Tensor:
+    """Whether tiles may see solids, bool (K, B, T): of all shapes, one after the other.
 
     Args:
-        shape: of the solids.
-        size: of each, (3, B, K).
-        offset: from the eyes to their centres, (3, B, K).
+        solids: of the scenes.
+        eye: in the worlds, (B, 3).
         axis: of the tiles' cones, (B, T, 3).
         cone: half their angles [rad], (T,).
     """
-    x, y, z = offset
-    (radius, half), away = extent(shape, size), torch.hypot(x, y)
+    extents = [extent(shape, group.size[..., 0]) for shape, group in solids.groups]
+    radius, half = (torch.cat(parts, -1) for parts in zip(*extents, strict=True))
+    x, y, z = torch.cat([group.centre[..., 0] for _, group in solids.groups], -1) - eye.T[:, :, None]
+    away = torch.hypot(x, y)
     # how far a solid and a tile reach to either side; all around where they are above, below or around
     wide = torch.asin((radius / away).clamp(max=1)) + torch.where(away <= radius, math.pi, _MARGIN_RAD)
     up = torch.asin(axis[..., 2].clamp(-1, 1))
     side = torch.where(up.abs() + cone < math.pi / 2, cone.sin() / up.cos(), 2.0)
     side = torch.where(side < 1, torch.asin(side.clamp(max=1)), math.pi)
-    turn = torch.atan2(y, x).T[..., None] - torch.atan2(axis[..., 1], axis[..., 0])
-    beside = (torch.remainder(turn + math.pi, 2 * math.pi) - math.pi).abs() <= wide.T[..., None] + side
     near, far = (away - radius).clamp(min=0), away + radius
     top, bottom = z + half, z - half
-    highest = torch.atan2(top, torch.where(top > 0, near, far)).T[..., None] + _MARGIN_RAD
-    lowest = torch.atan2(bottom, torch.where(bottom > 0, far, near)).T[..., None] - _MARGIN_RAD
-    return beside & (up - cone <= highest) & (up + cone >= lowest)
+    highest = torch.atan2(top, torch.where(top > 0, near, far)) + _MARGIN_RAD
+    lowest = torch.atan2(bottom, torch.where(bottom > 0, far, near)) - _MARGIN_RAD
+    # (K, B, 1) beside (B, T)
+    turn, wide, highest, lowest = (p.T.float()[..., None] for p in (torch.atan2(y, x), wide, highest, lowest))
+    turn = turn - torch.atan2(axis[..., 1], axis[..., 0]).float()
+    # an angle between directions, whichever way round
+    beside = math.pi - (turn.abs() - math.pi).abs() <= wide + side.float()
+    return beside & ((up - cone).float() <= highest) & ((up + cone).float() >= lowest)
 
 
 class _Met(NamedTuple):
@@ -174,9 +178,7 @@ def _walls(solids: Solids, eye: Tensor, direction: Components) -> _Met:
     return _Met(best, face)
 
 
-def _stand_before(
-    met: _Met, solids: Solids, eye: Tensor, rotation: Tensor, pixels: _Pixels, near: Sequence[Tensor]
-) -> None:
+def _stand_before(met: _Met, solids: Solids, eye: Tensor, rotation: Tensor, pixels: _Pixels, near: Tensor) -> None:
     """Put what stands in the rooms before their walls, in place.
 
     Args:
@@ -185,32 +187,37 @@ def _stand_before(
         eye: in the worlds, float64 (B, 3).
         rotation: of the cameras, float64 (B, 3, 3).
         pixels: what they see.
-        near: of each shape, see `_reached`.
+        near: see `_reached`.
     """
-    place = _FACES
-    for (shape, group), reached in zip(solids.groups, near, strict=True):
-        count, _, tiles = reached.shape
-        which, batch, tile = reached.nonzero().unbind(1)
-        row, own = batch * tiles + tile, batch * count + which
+    which, batch, tile = near.nonzero().unbind(1)
+    row = batch * near.shape[2] + tile
+    counts = [group.geom.shape[1] for _, group in solids.groups]
+    parts = [part.count_nonzero() for part in near.split(counts)]
+    ends = torch.stack(parts).tolist()
+    found, place = [], 0
+    for (shape, group), number, b, t, count in zip(
+        solids.groups, which.split(ends), batch.split(ends), tile.split(ends), counts, strict=True
+    ):
+        own = b * count + number - place
         # in double precision: a ray that grazes a cylinder magnifies rounding a thousandfold
-        x, y, z = (part.index_select(0, tile) for part in pixels.ray)
-        dx, dy, dz = ((x * a).addcmul_(y, b).addcmul_(z, c) for a, b, c in rotation[batch].permute(1, 2, 0)[..., None])
+        x, y, z = (part.index_select(0, t) for part in pixels.ray)
+        dx, dy, dz = ((x * a).addcmul_(y, b).addcmul_(z, c) for a, b, c in rotation[b].permute(1, 2, 0)[..., None])
         rx, ry, rz = (part.reshape(-1)[own, None] for part in group.centre[..., 0] - eye.T[:, :, None])
         (sx, sy, sz), (c, s) = (part.flatten(1)[:, own, None].unbind(0) for part in (group.size, group.turn))
-        range_m = first(*chord(shape, (rx, ry, rz), (sx, sy, sz), (c, s), (dx, dy, dz))).float()
-        # one solid after the other: no two of its pairs are of one tile
-        ends = which.bincount(minlength=count).tolist()
-        for number, (rows, found) in enumerate(zip(row.split(ends), range_m.split(ends), strict=True)):
-            if len(rows) == 0:
-                continue
-            before, surface = met.range_m.index_select(0, rows), met.surface.index_select(0, rows)
-            surface.add_((found < before).int().mul_(place + number - surface))
-            met.surface.index_copy_(0, rows, surface)
-            met.range_m.index_copy_(0, rows, torch.minimum(found, before))
+        found.append(first(*chord(shape, (rx, ry, rz), (sx, sy, sz), (c, s), (dx, dy, dz))).float())
         place += count
+    range_m, which = torch.cat(found), which.int().add_(_FACES)
+    # the first solids of all tiles, the second ones, ...: no tile comes twice at once
+    layer = near.cumsum(0)[near] - 1
+    for pairs in layer.argsort(stable=True).split(layer.bincount().tolist()):
+        rows, here = row[pairs], range_m.index_select(0, pairs)
+        before, surface = met.range_m.index_select(0, rows), met.surface.index_select(0, rows)
+        surface.add_((here < before).int().mul_(which[pairs, None] - surface))
+        met.surface.index_copy_(0, rows, surface)
+        met.range_m.index_copy_(0, rows, torch.minimum(here, before))
 
 
-def _normals(met: _Met, solids: Solids, eye: Tensor, direction: Components, near: Sequence[Tensor]) -> list[Tensor]:
+def _normals(met: _Met, solids: Solids, eye: Tensor, direction: Components, near: Tensor) -> list[Tensor]:
     """Of the first surfaces, by component (B · T, 64): into the room, or out of what stands in it.
 
     Args:
@@ -218,17 +225,17 @@ def _normals(met: _Met, solids: Solids, eye: Tensor, direction: Components, near
         solids: of the scenes.
         eye: in the worlds, (B, 3).
         direction: of the rays, (B · T, 64).
-        near: of each shape, see `_reached`.
+        near: see `_reached`.
     """
-    inward = torch.zeros(3, _FACES + sum(len(reached) for reached in near)).to(met.range_m)
+    inward = torch.zeros(3, _FACES + len(near)).to(met.range_m)
     for axis in range(3):
         inward[axis, 2 * axis], inward[axis, 2 * axis + 1] = 1, -1
     which = met.surface.view(-1)
     normal = [part.index_select(0, which).view_as(met.range_m) for part in inward]
     place = _FACES
-    for (shape, group), reached in zip(solids.groups, near, strict=True):
-        count, _, tiles = reached.shape
-        rows = reached.any(0).view(-1).nonzero()[:, 0]
+    for shape, group in solids.groups:
+        count, tiles = group.geom.shape[1], near.shape[2]
+        rows = near[place - _FACES :][:count].any(0).view(-1).nonzero()[:, 0]
         if len(rows) > 0:
             number = met.surface.index_select(0, rows).sub_(place)
             mine = (number >= 0) & (number < count)
@@ -271,10 +278,7 @@ def draw_pictures(scenes: Painted, rotation: Tensor, eye: Tensor, camera: Camera
     direction = (dx, dy, dz)
     axis = pixels.axis @ rotation.mT
     met = _walls(solids, eye, direction)
-    near = [
-        _reached(shape, group.size[..., 0], group.centre[..., 0] - eye.T[:, :, None], axis, pixels.cone)
-        for shape, group in solids.groups
-    ]
+    near = _reached(solids, eye, axis, pixels.cone)
     _stand_before(met, solids, eye, rotation, pixels, near)
     nx, ny, nz = _normals(met, solids, eye, direction, near)
     slant = (dx * nx).addcmul_(dy, ny).addcmul_(dz, nz).abs_().clamp_(min=_STEEPEST)

@@ -19,7 +19,7 @@ from torchfovea.sim.backend import load_mujoco
 from torchfovea.sim.drawing import Painted, draw_pictures, paint_scenes
 from torchfovea.sim.model import Scene
 
-__all__ = ["MISS_RANGE_M", "Frame", "RayHits", "Renderer", "cast", "render"]
+__all__ = ["MISS_RANGE_M", "Frame", "RayHits", "Renderer", "cast", "render", "render_together"]
 
 MISS_RANGE_M = 1000.0
 """The range that a ray gets which meets nothing; its geom is -1."""
@@ -162,15 +162,15 @@ def cast(scene: Scene, origin_e: Tensor, directions_e: Tensor) -> RayHits:
     )
 
 
-_painted: weakref.WeakKeyDictionary[Any, dict[torch.device, Painted]] = weakref.WeakKeyDictionary()
+_painted: weakref.WeakKeyDictionary[Any, dict[tuple[torch.device, int], Painted]] = weakref.WeakKeyDictionary()
 
 
-def _paint(scene: Scene, device: torch.device) -> Painted:
-    """A scene as tensors; wherever the robot stands, they are the same."""
+def _paint(scene: Scene, device: torch.device, count: int) -> Painted:
+    """A scene as tensors, so many times; wherever the robot stands, they are the same."""
     known = _painted.setdefault(scene.model, {})
-    if device not in known:
-        known[device] = paint_scenes([scene], device)
-    return known[device]
+    if (device, count) not in known:
+        known[device, count] = paint_scenes([scene] * count, device)
+    return known[device, count]
 
 
 def render(scene: Scene, R: Tensor, t: Tensor, camera: Camera, size_px: int) -> Frame:
@@ -186,16 +186,18 @@ def render(scene: Scene, R: Tensor, t: Tensor, camera: Camera, size_px: int) -> 
     Raises:
         SettingError: wrong shapes or size, or an eye outside of a closed room.
     """
-    require(isinstance(size_px, int) and 2 <= size_px <= 8192, "size_px", size_px, "a whole number from 2 to 8192")
     require(R.shape == (3, 3), "R", tuple(R.shape), "(3, 3)")
     require(t.shape == (3,), "t", tuple(t.shape), "(3,)")
+    return render_together(scene, R[None], t[None], camera, size_px)[0]
+
+
+def render_together(scene: Scene, R: Tensor, t: Tensor, camera: Camera, size_px: int) -> list[Frame]:
+    """The pictures of `render` for K eyes, R (K, 3, 3) and t (K, 3), cheaper than one after the other."""
+    require(isinstance(size_px, int) and 2 <= size_px <= 8192, "size_px", size_px, "a whole number from 2 to 8192")
     rotation, translation = (torch.from_numpy(part).to(R.device) for part in scene.world_from_ego)
-    turn, eye = rotation @ R.detach().double(), rotation @ t.detach().to(R.device).double() + translation
-    drawn = draw_pictures(_paint(scene, R.device), turn[None], eye[None], camera, size_px)
-    normal = rotation.float().T @ drawn.normal[0].reshape(3, -1)
-    return Frame(
-        drawn.image[0],
-        drawn.range_m[0].clamp(max=MISS_RANGE_M),
-        drawn.geom[0],
-        normal.view(3, size_px, size_px).permute(1, 2, 0),
-    )
+    turn, eye = rotation @ R.detach().double(), t.detach().to(R.device).double() @ rotation.T + translation
+    drawn = draw_pictures(_paint(scene, R.device, len(R)), turn, eye, camera, size_px)
+    normal = rotation.float().T @ drawn.normal.flatten(2)
+    normal = normal.view(-1, 3, size_px, size_px).permute(0, 2, 3, 1)
+    range_m = drawn.range_m.clamp(max=MISS_RANGE_M)
+    return [Frame(*parts) for parts in zip(drawn.image, range_m, drawn.geom, normal, strict=True)]

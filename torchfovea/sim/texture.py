@@ -80,16 +80,27 @@ def _noise(point: Components, scale: int) -> tuple[Tensor, ...]:
     return _volume(x.device).at(u, v, w)
 
 
-def _fading(scale: int) -> list[tuple[float, float]]:
-    """Amplitude of a scale's octaves, and their decay with the variance of the Gaussian footprint."""
-    octaves = zip(_AMPLITUDES[3 * scale :], _WAVELENGTHS, strict=False)
-    return [(a, -2 * math.pi**2 / (w * _VOXELS_M[scale]) ** 2) for a, w in octaves]
+def _decay(scale: int) -> float:
+    """By which a scale's coarsest octave, e to that times the variance of the Gaussian footprint, fades."""
+    return -2 * math.pi**2 / (_WAVELENGTHS[-1] * _VOXELS_M[scale]) ** 2
 
 
 def _widest(scale: int) -> float:
     """The footprint's variance at which a scale's coarsest octave has all but vanished."""
-    amplitude, decay = _fading(scale)[-1]
-    return math.log(_FAINTEST / amplitude) / decay
+    return math.log(_FAINTEST / _AMPLITUDES[3 * scale + 2]) / _decay(scale)
+
+
+def _octaves(noise: tuple[Tensor, ...], spread: Tensor, scale: int) -> tuple[Tensor, Tensor]:
+    """Sum of a scale's faded octaves, and its variance."""
+    value, power = torch.zeros_like(spread), torch.zeros_like(spread)
+    fade = (spread * _decay(scale)).exp_()
+    for octave in (2, 1, 0):
+        amplitude = _AMPLITUDES[3 * scale + octave]
+        value.addcmul_(noise[octave], fade, value=amplitude)
+        power.addcmul_(fade, fade, value=amplitude**2)
+        # half the wavelength, the fourth power
+        fade = fade.square_().square_()
+    return value, power
 
 
 def _log_albedo(point: Components, spread: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -101,26 +112,23 @@ def _log_albedo(point: Components, spread: Tensor) -> tuple[Tensor, Tensor, Tens
     """
     last = len(_VOXELS_M) - 1
 
-    def octaves(noise: tuple[Tensor, ...], spread: Tensor, scale: int) -> tuple[Tensor, Tensor]:
-        value, power = torch.zeros_like(spread), torch.zeros_like(spread)
-        for wave, (amplitude, decay) in zip(noise, _fading(scale), strict=False):
-            fade = (spread * decay).exp_().mul_(amplitude)
-            value.addcmul_(wave, fade)
-            power.addcmul_(fade, fade)
-        return value, power
-
     coarse = _noise(point, last)
-    value, power = octaves(coarse, spread, last)
+    value, power = _octaves(coarse, spread, last)
     narrowest = spread.amin(1)
     for scale in range(last):
         # most pixels are too wide for the finest octaves: look up only where they are not
         rows = (narrowest < _widest(scale)).nonzero()[:, 0]
         if len(rows) == 0:
             continue
-        x, y, z = (part.index_select(0, rows) for part in point)
-        found = octaves(_noise((x, y, z), scale), spread.index_select(0, rows), scale)
-        value.index_add_(0, rows, found[0])
-        power.index_add_(0, rows, found[1])
+        few = len(rows) < 0.9 * len(spread)
+        x, y, z, part = (p.index_select(0, rows) if few else p for p in (*point, spread))
+        own_value, own_power = _octaves(_noise((x, y, z), scale), part, scale)
+        if few:
+            value.index_add_(0, rows, own_value)
+            power.index_add_(0, rows, own_power)
+        else:
+            value.add_(own_value)
+            power.add_(own_power)
     return value, power, coarse[3]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Literal, NamedTuple
 
 import torch
@@ -15,7 +16,7 @@ from torchfovea.sim.gl import opengl
 from torchfovea.sim.model import EgoPose, Scene
 from torchfovea.sim.motor import InstantMotor, Motor, Moved
 from torchfovea.sim.noise import ImageNoise, expose
-from torchfovea.sim.rays import Frame, RayHits, Renderer, cast, render
+from torchfovea.sim.rays import Frame, RayHits, Renderer, cast, render, render_together
 from torchfovea.sim.servo import ServoMotor
 
 __all__ = ["Fixated", "Seen", "World"]
@@ -94,6 +95,8 @@ class World:
         self.camera = Pinhole.from_fov(90.0, radius_px) if camera is None else camera
         self.source_px = source_px
         self.image_camera = image_camera(self.camera, radius_px, source_px)
+        if isinstance(renderer, partial) and renderer.func is render and not renderer.args + tuple(renderer.keywords):
+            renderer = "rays"  # what a configuration makes of it
         self._render: Renderer = opengl() if renderer == "gl" else render if isinstance(renderer, str) else renderer
         self.motor: Motor
         if motor == "instant":
@@ -134,10 +137,16 @@ class World:
     def images(self, gaze: Gaze | None = None) -> tuple[Frame, Frame]:
         """Left and right pictures at a gaze (the current one by default)."""
         pose = eyes(self.head, self._one(gaze))
-        left, right = (
-            self._render(self.scene, r, t, self.image_camera, self.source_px)
-            for r, t in ((pose.R_left, pose.t_left), (pose.R_right, pose.t_right))
-        )
+        rotations, centres = (pose.R_left, pose.R_right), (pose.t_left, pose.t_right)
+        if self._render is render:
+            left, right = render_together(
+                self.scene, torch.stack(rotations), torch.stack(centres), self.image_camera, self.source_px
+            )
+        else:
+            left, right = (
+                self._render(self.scene, r, t, self.image_camera, self.source_px)
+                for r, t in zip(rotations, centres, strict=True)
+            )
         for frame in (left, right):
             require(isinstance(frame, Frame), "renderer", type(frame).__name__, "a torchfovea.sim.rays.Frame")
             shape = (3, self.source_px, self.source_px)
