@@ -124,6 +124,17 @@ def test_half_a_retina_stands_for_all_of_it(retina):
         assert float(a) == pytest.approx(float(b), rel=1e-9)
 
 
+@pytest.mark.parametrize("sensor", [LOG_POLAR, UNIFORM], ids=["log_polar", "uniform"])
+def test_a_third_of_the_retina_stands_for_all_of_it(sensor):
+    third = half_retina(CAMERA, sensor.retina, every=3)
+    assert float(third.weight.sum()) == pytest.approx(sensor.retina.count, rel=1e-3)
+    for distance, vergence in ((0.1, 0.0), (0.4, 0.2), (1.0, 0.8)):
+        some, every = (plane_information(sensor, distance, vergence, p) for p in (third, None))
+        assert float(some.information) == pytest.approx(float(every.information), abs=0.01)
+        assert float(some.information_solid_angle) == pytest.approx(float(every.information_solid_angle), abs=0.01)
+        assert float(some.matched_fraction) == pytest.approx(float(every.matched_fraction), abs=0.005)
+
+
 def test_precision_is_the_callers():
     single = [plane_information(s, 0.3, 0.2) for s in SMALL]
     double = [plane_information(s, 0.3, 0.2, half_retina(CAMERA, s.retina, torch.float64)) for s in SMALL]

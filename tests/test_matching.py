@@ -226,7 +226,7 @@ def test_a_posed_rig_is_the_verged_one():
     assert other.baseline_m == pytest.approx(BASELINE)
 
 
-@pytest.mark.parametrize("params", [SGBM(), SGBM.authors, SGBM(mode="sgbm"), SGBM(uniqueness_percent=0)])
+@pytest.mark.parametrize("params", [SGBM(), SGBM.authors, SGBM(mode="hh4"), SGBM(uniqueness_percent=0)])
 @pytest.mark.parametrize("value", [0.0, 0.5, 0.7, 1.0])
 def test_without_texture_nothing_matches(params, value):
     image = torch.full((3, 90, 90), value)

@@ -22,7 +22,7 @@ from torchfovea.setting import require
 
 __all__ = ["Observations", "observe", "triangulate", "triangulate_rectified"]
 
-BLOCK = 16384  # receptive fields at once, a thread: intermediate results stay in its cache
+BLOCK = 16384  # receptive fields at once, a thread: intermediate results stay in its cache; half of them point by point
 
 
 class Observations(NamedTuple):
@@ -192,7 +192,8 @@ def observe(
     learning = torch.is_grad_enabled() and any(t.requires_grad for t in (*matches[:4], *eyes))
     if learning:
         matches = _safe(matches, cameras, transform)
-    blocks = max(1, round(matches.valid.numel() / (BLOCK * torch.get_num_threads())))
+    block = BLOCK // (2 if form is None else 1)
+    blocks = max(1, round(matches.valid.numel() / (block * torch.get_num_threads())))
     size = count if learning or matches.valid.device.type != "cpu" else -(-count // blocks)
     parts = []
     if form is not None and is_compiling() and not learning:

@@ -199,13 +199,14 @@ def solid_angle_sr(camera: Camera, retina: Retina, px: Tensor) -> Tensor:
     return retina.width_px(px).square() * per_px
 
 
-def half_retina(camera: Camera, retina: Retina, dtype: torch.dtype = torch.float32) -> Places:
+def half_retina(camera: Camera, retina: Retina, dtype: torch.dtype = torch.float32, every: int = 1) -> Places:
     """RFs enough to know all of them where the scene is as symmetric as a plane, up and down.
 
     Args:
         camera: of the eyes.
         retina: their layout.
         dtype: of the result.
+        every: only every so-many-th of them, for as many times more.
 
     Returns:
         The lower half, each for two, where the layout is its own mirror image; otherwise every RF.
@@ -215,9 +216,9 @@ def half_retina(camera: Camera, retina: Retina, dtype: torch.dtype = torch.float
     mirrored = places * places.new_tensor([1, -1])
     symmetric = torch.equal(torch.unique(places, dim=0), torch.unique(mirrored, dim=0))
     weight = 1 + torch.sign(places[:, 1]) if symmetric else torch.ones_like(px[:, 0])
-    keep = weight > 0
+    keep = (weight > 0).nonzero()[::every, 0]
     half = columns(px[keep, 0].to(dtype), px[keep, 1].to(dtype))
-    return Places(half, weight[keep].to(dtype), solid_angle_sr(camera, retina, half))
+    return Places(half, every * weight[keep].to(dtype), solid_angle_sr(camera, retina, half))
 
 
 def plane_information(
@@ -259,7 +260,11 @@ def _mean(values: Tensor, weights: Tensor) -> Tensor:
 
 
 def characterize_planes(
-    sensor: PlaneSensor, distance_m: Tensor, vergence_rad: Tensor, done: Callable[[], None] | None = None
+    sensor: PlaneSensor,
+    distance_m: Tensor,
+    vergence_rad: Tensor,
+    done: Callable[[], None] | None = None,
+    places: Places | None = None,
 ) -> Characterization:
     """Look at every plane with every vergence (paper Fig. 5).
 
@@ -268,11 +273,12 @@ def characterize_planes(
         distance_m: (D,), > 0.
         vergence_rad: (V,).
         done: called without arguments after each look.
+        places: as in `plane_information`.
 
     Raises:
         SettingError: for a plane that is not in front.
     """
-    places = half_retina(sensor.camera, sensor.retina)
+    places = places or half_retina(sensor.camera, sensor.retina)
     looks = []
     for distance in distance_m.tolist():
         for vergence in vergence_rad.tolist():
@@ -293,7 +299,9 @@ def spread_over_vergence(grid: Characterization) -> Tensor:
     return torch.where(seen.any(1), high - low, torch.zeros_like(high))
 
 
-def peak_vergence(sensor: PlaneSensor, grid: Characterization, row: int, rounds: int = 2) -> float:
+def peak_vergence(
+    sensor: PlaneSensor, grid: Characterization, row: int, rounds: int = 2, places: Places | None = None
+) -> float:
     """The vergence with the most information about one plane of a grid, refined between the grid's vergences.
 
     Args:
@@ -301,11 +309,12 @@ def peak_vergence(sensor: PlaneSensor, grid: Characterization, row: int, rounds:
         grid: from `characterize_planes`.
         row: which distance.
         rounds: each looks at nine vergences in the gap around the best one so far, which shrinks by four.
+        places: as in `plane_information`.
 
     Returns:
         The vergence [rad].
     """
-    places = half_retina(sensor.camera, sensor.retina)
+    places = places or half_retina(sensor.camera, sensor.retina)
     angles = grid.vergence_rad.double()
     seen = torch.where(grid.matched_fraction[row] > 0, grid.information[row], -math.inf)
     best = float(angles[seen.argmax()])

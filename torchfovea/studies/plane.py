@@ -18,6 +18,7 @@ from torchfovea.studies.characterization import plane_points
 __all__ = ["draw_plane", "octave_noise"]
 
 TABLE = 256  # knots of an octave's random surface along a side, after which it repeats
+UNSEEN = 1e-9  # an octave of less contrast is left out
 
 
 def octave_noise(
@@ -43,9 +44,12 @@ def octave_noise(
         shift = TABLE * torch.rand(2, generator=generator, dtype=place_m.dtype)
         # two more knots on either side: cubic interpolation goes on across the seam
         wrapped = F.pad(table[None, None].to(place_m), (2, 2, 2, 2), mode="circular")
+        fade = torch.exp(-0.8 * (footprint_m / spacing) ** 2)
+        if float(fade.detach().max()) < UNSEEN:
+            continue
         grid = 2 * (torch.remainder(flat / spacing + shift.to(place_m), TABLE) + 2) / (TABLE + 3) - 1
         surface = F.grid_sample(wrapped, grid, mode="bicubic", align_corners=True).reshape(footprint_m.shape)
-        total = total + torch.exp(-0.8 * (footprint_m / spacing) ** 2) * surface
+        total = total + fade * surface
     return 0.5 + 0.5 * torch.tanh(0.35 * total)
 
 

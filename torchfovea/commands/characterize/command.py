@@ -25,8 +25,10 @@ from torchfovea.sensing.layout import LogPolar, Uniform
 from torchfovea.setting import require
 from torchfovea.studies.characterization import (
     Characterization,
+    Places,
     PlaneSensor,
     characterize_planes,
+    half_retina,
     matched_vergence,
     peak_vergence,
     plane_information,
@@ -42,8 +44,12 @@ ADVANTAGE_COLUMNS = (
     "uniform_information",
 )  # fmt: skip
 # Sizes that a profile chooses where a setting is null
-QUICK = {"distances": 5, "vergences": 13, "propagation.samples": 50_000, "realised.source_px": [200]}
-FULL = {"distances": 20, "vergences": 31, "propagation.samples": 1 << 20, "realised.source_px": [200, 400, 800]}
+QUICK = {
+    "distances": 5, "vergences": 13, "every": 1, "propagation.samples": 50_000, "realised.source_px": [200]
+}  # fmt: skip
+FULL = {
+    "distances": 20, "vergences": 31, "every": 3, "propagation.samples": 1 << 20, "realised.source_px": [200, 400, 800]
+}  # fmt: skip
 
 
 def run(cfg: DictConfig) -> float:
@@ -57,7 +63,7 @@ def run(cfg: DictConfig) -> float:
     full = {name: _with(sensor, _budget(cfg, whole(cfg, "sensor.source_px", 16))) for name, sensor in printed.items()}
     distance, vergence = _axis(cfg, "distance", "_m"), torch.deg2rad(_axis(cfg, "vergence", "_deg"))
     sources, matched = wholes(cfg, "advantage_source_px"), matched_vergence(printed["uniform"].baseline_m, distance)
-    tasks = plan_planes(cfg)
+    tasks, every = plan_planes(cfg), whole(cfg, "every", 1)
     planned = plan_cases(cfg, full["log_polar"]) if cfg.propagation.run else None
     generator = torch.Generator().manual_seed(whole(cfg, "seed", 0))
     layouts = _small_layouts(cfg)
@@ -73,15 +79,23 @@ def run(cfg: DictConfig) -> float:
         def done() -> None:
             progress.update(task, advance=1)
 
-        grids = {name: characterize_planes(sensor, distance, vergence, done) for name, sensor in printed.items()}
-        budgeted = {name: characterize_planes(sensor, distance, vergence, done) for name, sensor in full.items()}
+        halves = {name: half_retina(sensor.camera, sensor.retina) for name, sensor in printed.items()}
+        grids, budgeted = (
+            {
+                name: characterize_planes(
+                    sensor, distance, vergence, done, half_retina(sensor.camera, sensor.retina, every=every)
+                )
+                for name, sensor in sensors.items()
+            }
+            for sensors in (printed, full)
+        )
         _write_fig5(folder / "fig5.csv", grids)
         _write_fig5(folder / "fig5_budget.csv", budgeted)
         progress.update(task, description="advantage")
         readings: dict[str, Budget] = {"printed": printed["uniform"].budget}
         readings |= {f"source_{size}": _budget(cfg, size) for size in sources}
-        advantage = {name: _advantage(printed, budget, distance, matched) for name, budget in readings.items()}
-        figures |= _fig5_figures(printed, grids, matched, advantage)
+        advantage = {name: _advantage(printed, halves, budget, distance, matched) for name, budget in readings.items()}
+        figures |= _fig5_figures(printed, halves, grids, matched, advantage)
         if planned is not None:
             task = progress.add_task("propagation", total=math.ceil(planned[1] / CHUNK))
             figures |= propagate(folder, *planned, generator, done)
@@ -156,11 +170,13 @@ def _write_fig5(path: Path, grids: dict[str, Characterization]) -> None:
 Advantage = list[tuple[float | None, float | None, float | None, float | None]]
 
 
-def _advantage(sensors: dict[str, PlaneSensor], budget: Budget, distance: Tensor, vergence: Tensor) -> Advantage:
+def _advantage(
+    sensors: dict[str, PlaneSensor], places: dict[str, Places], budget: Budget, distance: Tensor, vergence: Tensor
+) -> Advantage:
     """For each distance at its matched vergence: plain, by solid angle, and both sensors' plain information."""
     rows: Advantage = []
     for d, v in zip(distance.tolist(), vergence.tolist(), strict=True):
-        foveal, uniform = (plane_information(_with(sensors[name], budget), d, v) for name in SENSORS)
+        foveal, uniform = (plane_information(_with(sensors[name], budget), d, v, places[name]) for name in SENSORS)
         if foveal.matched_fraction > 0 and uniform.matched_fraction > 0:
             plain, wide = (float(a - b) for a, b in zip(foveal[:2], uniform[:2], strict=True))
             rows.append((plain, wide, float(foveal.information), float(uniform.information)))
@@ -175,6 +191,7 @@ def _known(rows: Advantage, column: int) -> list[float]:
 
 def _fig5_figures(
     sensors: dict[str, PlaneSensor],
+    places: dict[str, Places],
     grids: dict[str, Characterization],
     matched: Tensor,
     advantage: dict[str, Advantage],
@@ -189,7 +206,8 @@ def _fig5_figures(
         & (foveal.matched_fraction > 0).any(1)
     )
     rows = inside.nonzero().flatten().tolist()
-    errors = [abs(peak_vergence(sensors["log_polar"], foveal, i) - float(matched[i])) for i in rows]
+    peaks = [peak_vergence(sensors["log_polar"], foveal, i, places=places["log_polar"]) for i in rows]
+    errors = [abs(peak - float(matched[i])) for peak, i in zip(peaks, rows, strict=True)]
     spread = spread_over_vergence(uniform) / spread_over_vergence(foveal).clamp(min=1e-9)
     down = uniform.information[1:] < uniform.information[:-1]
     seen = (uniform.matched_fraction[1:] > 0) & (uniform.matched_fraction[:-1] > 0)
