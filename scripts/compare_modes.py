@@ -1,7 +1,7 @@
 """How true and how fast SGBM is by its modes, each with the budget that comes along: `python scripts/compare_modes.py`.
 
 Two looks at each of six fresh `cans` rooms with image noise, at 60, 90 and 135 degrees, and real pairs with true
-disparity: `python scripts/compare_modes.py motorcycle FOLDER ...`. Milliseconds of CPU are of a pair matched and judged.
+disparity: `python scripts/compare_modes.py motorcycle FOLDER ...`. Milliseconds are of a pair, matched and judged.
 """
 
 from __future__ import annotations

@@ -27,22 +27,10 @@ from torchfovea.sensing.unscented import SigmaPoints
 from torchfovea.setting import require
 
 __all__ = [
-    "Characterization",
-    "Places",
-    "PlaneSensor",
-    "Snapshot",
-    "characterize_planes",
-    "correspond_plane",
-    "elementwise_jacobian",
-    "half_retina",
-    "matched_vergence",
-    "peak_vergence",
-    "plane_information",
-    "plane_points",
-    "solid_angle_sr",
-    "spread_over_vergence",
-    "straight_eyes",
-]
+    "Characterization", "Places", "PlaneSensor", "Snapshot", "characterize_planes", "correspond_plane",
+    "elementwise_jacobian", "half_retina", "matched_vergence", "peak_vergence", "plane_information", "plane_points",
+    "solid_angle_sr", "spread_over_vergence", "straight_eyes",
+]  # fmt: skip
 
 GRAZING = 1e-6  # rays closer than this to parallel with the plane do not meet it
 
