@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import json
 import math
+import subprocess
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,15 +12,17 @@ import pytest
 import torch
 
 from torchfovea.cli import main
+from torchfovea.commands.bench import against, builders, paths, retina_paths, steps, timing
 from torchfovea.commands.bench import command as bench
-from torchfovea.commands.bench import paths, retina_paths, steps, timing
 from torchfovea.commands.bench.look import saccade
+from torchfovea.commands.bench.memory import peak_bytes
 from torchfovea.commands.bench.timing import Growth, Path, copy_bandwidth, interleaved, nbytes, same, slope
 from torchfovea.memory import sphere
 from torchfovea.memory.egosphere import Fusion
 from torchfovea.perception import Observer
 from torchfovea.sensing.head import fixate
 from torchfovea.sensing.layout import LogPolar
+from torchfovea.setting import SettingError
 
 FULL = Observer(retina=LogPolar(1500))
 PLAIN = dataclasses.replace(FULL, fusion=Fusion(fill=False, conflict=math.inf))
@@ -106,7 +109,7 @@ def test_same_says_what_differs():
 def test_times_are_medians_taken_in_turns(monkeypatch):
     """By a clock that only the work moves."""
     order, now = [], [0.0]
-    clock = SimpleNamespace(perf_counter=lambda: now[0], sleep=lambda seconds: None)
+    clock = SimpleNamespace(perf_counter=lambda: now[0], process_time=lambda: 2 * now[0], sleep=lambda seconds: None)
     monkeypatch.setattr(timing, "time", clock)
 
     def work(name, seconds):
@@ -115,7 +118,7 @@ def test_times_are_medians_taken_in_turns(monkeypatch):
 
     slow, fast = interleaved([lambda: work("slow", 0.012), lambda: work("fast", 0.002)], 0.2)
     assert slow.runs == fast.runs >= 3
-    assert slow[:3] == pytest.approx((12, 12, 12)) and fast[:3] == pytest.approx((2, 2, 2))
+    assert slow[:4] == pytest.approx((12, 12, 12, 24)) and fast[:4] == pytest.approx((2, 2, 2, 4))
     assert order[:8] == ["slow", "fast", "slow", "fast", "fast", "slow", "slow", "fast"]
     assert len(order) == 2 * (slow.runs + 1)
     order.clear()
@@ -130,6 +133,70 @@ def test_slopes_are_powers(power):
 def test_bytes_and_bandwidth():
     assert nbytes(torch.ones(3, 2), (torch.ones(5, dtype=torch.float64), 7), None) == 24 + 40
     assert 1e8 < copy_bandwidth(0.01) < 1e13
+
+
+def test_memory_is_what_a_call_holds_at_most():
+    held = peak_bytes(lambda: torch.ones(1 << 24).add_(torch.ones(1 << 24)))
+    assert held is None or 1 << 26 < held < 1 << 28
+
+
+def test_a_commits_files_are_put_aside(tmp_path):
+    git = ["git", "-C", str(tmp_path / "repository"), "-c", "user.name=n", "-c", "user.email=e"]
+    (tmp_path / "repository").mkdir()
+    for text, *commands in (("one", ["init", "-q"]), ("two",)):
+        (tmp_path / "repository" / "file").write_text(text)
+        for command in (*commands, ["add", "file"], ["commit", "-q", "-m", text]):
+            subprocess.run([*git, *command], check=True)
+    name = against.checkout(tmp_path / "repository", "HEAD^", tmp_path)
+    assert (tmp_path / "file").read_text() == "one" and len(name) == 40
+    with pytest.raises(SettingError, match="against = never: expected a commit"):
+        against.checkout(tmp_path / "repository", "never", tmp_path)
+
+
+TREE = """
+from types import SimpleNamespace
+PATHS = ("step", "align")
+def builders_of(cfg, device, wanted):
+    def path(name, units):
+        return SimpleNamespace(name=name, work="so much", units=units, run=lambda: sum(range(200_000)))
+    return [lambda: [path(name, units) for name, units in NAMES]]
+"""
+
+
+def tree(folder, names):
+    """A package of which only the bench is there, with paths of some names and units."""
+    for package in ("", "commands", "commands/bench", "commands/shared"):
+        (folder / "torchfovea" / package).mkdir(parents=True)
+        (folder / "torchfovea" / package / "__init__.py").touch()
+    (folder / "torchfovea/commands/bench/builders.py").write_text(f"NAMES = {names}\n{TREE}")
+    (folder / "torchfovea/commands/shared/config.py").write_text(f"def conf_dir(): return {str(folder)!r}\n")
+    (folder / "bench.yaml").write_text("device: cpu\nthreads: 1\npaths: null\n")
+    return folder
+
+
+def test_two_trees_take_turns(tmp_path):
+    one = tree(tmp_path / "one", [("step", 4), ("align", 1), ("step", 1)])
+    other = tree(tmp_path / "other", [("align", 1), ("step", 1), ("step", 1)])
+    sides = [against._Side(folder, ["threads=1"], folder.name) for folder in (one, other)]
+    try:
+        rows = against.in_turns(*sides, 0.0)
+    finally:
+        for side in sides:
+            side.close()
+    assert [(row.path, row.runs) for row in rows] == [("step", 5), ("align", 5), ("step", 5)]
+    assert rows[0].least_ratio > 2 * rows[2].least_ratio > 0  # of a quarter of the same work
+    assert all(row.ratio == pytest.approx(row.then_cpu_ms / row.cpu_ms) for row in rows)
+    with pytest.raises(SettingError, match=r"against = old: expected a commit whose bench .* \(.*no_such.*\)"):
+        against._Side(other, ["no_such=1"], "old")
+
+
+def test_a_history_grows_by_lines(tmp_path):
+    for number in range(2):
+        against.add_line(tmp_path / "folder" / "history.jsonl", {"number": number})
+    lines = (tmp_path / "folder" / "history.jsonl").read_text().splitlines()
+    assert [json.loads(line)["number"] for line in lines] == [0, 1]
+    with pytest.raises(SettingError, match=r"history = .*: expected a file that can be written"):
+        against.add_line(tmp_path, {})
 
 
 def run(tmp_path, *overrides):
@@ -178,6 +245,8 @@ def test_some_paths_only(tmp_path, capsys):
         ("budget=printed", "budget.sigma_points = paper: expected ours"),
         ("batch=0", "batch = 0: expected at least 1"),
         ("seconds=-1", "seconds = -1: expected a positive number"),
+        ("against=no_such_commit", "against = no_such_commit: expected a commit of the checkout"),
+        ("history=h.jsonl", "history = h.jsonl: expected null, or against=COMMIT besides"),
     ],
 )
 def test_mistakes_are_worded(tmp_path, capsys, override, said):
@@ -192,7 +261,7 @@ def test_a_path_that_does_something_else_fails_the_command(tmp_path, capsys, mon
 
         return [Path("retina", "", "cpu", lambda: None, (), check, growths=(Growth("RFs", (1,), (lambda: None,)),))]
 
-    monkeypatch.setattr(bench, "path_of_retina", other)
+    monkeypatch.setattr(builders, "path_of_retina", other)
     assert run(tmp_path, "paths=[retina]") == 1
     assert "differ" in capsys.readouterr().err
     assert not (tmp_path / "run" / "result.json").exists()

@@ -192,7 +192,7 @@ def observe(
     learning = torch.is_grad_enabled() and any(t.requires_grad for t in (*matches[:4], *eyes))
     if learning:
         matches = _safe(matches, cameras, transform)
-    block = BLOCK // (2 if form is None else 1)
+    block = BLOCK if form is not None else -(-BLOCK // 2)
     blocks = max(1, round(matches.valid.numel() / (block * torch.get_num_threads())))
     size = count if learning or matches.valid.device.type != "cpu" else -(-count // blocks)
     parts = []

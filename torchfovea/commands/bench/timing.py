@@ -18,11 +18,12 @@ _COPIED = 16 << 20  # floats: far more than a cache holds
 
 
 class Timing(NamedTuple):
-    """Milliseconds of one call: median, quartiles, and of how many."""
+    """Milliseconds of one call: median, quartiles, the median of all threads' CPU time, and of how many calls."""
 
     median_ms: float
     low_ms: float
     high_ms: float
+    cpu_ms: float
     runs: int
 
 
@@ -127,6 +128,7 @@ def interleaved(
     """
     wait: Callable[[], None] = torch.cuda.synchronize if device.startswith("cuda") else lambda: None
     taken: list[list[float]] = [[] for _ in runs]
+    spent: list[list[float]] = [[] for _ in runs]
     for run in () if warm else runs:
         run()
     wait()
@@ -137,12 +139,17 @@ def interleaved(
         for place in range(len(runs)):
             which = (place + turn) % len(runs)
             time.sleep(_REST_S)
-            start = time.perf_counter()
+            start, cpu = time.perf_counter(), time.process_time()
             runs[which]()
             wait()
             taken[which].append(1e3 * (time.perf_counter() - start))
+            spent[which].append(1e3 * (time.process_time() - cpu))
     quartiles = [[float(q) for q in np.quantile(t, (0.5, 0.25, 0.75))] for t in taken]
-    return [Timing(middle, low, high, len(t)) for (middle, low, high), t in zip(quartiles, taken, strict=True)]
+    middles = [float(np.median(cpu)) for cpu in spent]
+    return [
+        Timing(middle, low, high, cpu, len(t))
+        for (middle, low, high), cpu, t in zip(quartiles, middles, taken, strict=True)
+    ]
 
 
 def copy_bandwidth(seconds: float, device: str = "cpu") -> float:
