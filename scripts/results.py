@@ -1,0 +1,271 @@
+"""The tables of docs/results, from the files that runs leave: no figure of theirs is typed.
+
+    python scripts/results.py keep search RUN_FOLDER ...   # right after the runs: what a table needs, and its origin
+    python scripts/results.py                              # writes every table anew
+    python scripts/results.py --check                      # says which is not what its data say
+
+A page says where its table stands, `<!-- results: NAME -->` to `<!-- end -->`; data are docs/results/data/NAME.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import os
+import platform
+import re
+import statistics
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+import yaml
+
+from torchfovea.files import write_json
+from torchfovea.studies.significance import bootstrap_interval
+
+PAGES = Path(__file__).resolve().parents[1] / "docs" / "results"
+MARKED = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+LARGEST = 20_000  # bytes of a table that is kept
+
+
+class Run(NamedTuple):
+    """What is kept of a run.
+
+    Attributes:
+        command: that made it.
+        commit: of the tree that ran it; a + behind it: with changes.
+        machine: in words.
+        result: its result.json, or the list in its claims.json.
+        tables: its small CSV files by their stems, a mapping a row.
+    """
+
+    command: str
+    commit: str
+    machine: str
+    result: Any
+    tables: dict[str, list[dict[str, str]]]
+
+
+def keep(name: str, folders: Sequence[Path], commit: str | None = None, pages: Path = PAGES) -> None:
+    """Keep what runs left, in place of what was kept under this name.
+
+    Args:
+        name: of the data.
+        folders: of the runs.
+        commit: of the tree that made them; None: the one here.
+        pages: where docs/results is.
+    """
+    runs = [_kept(folder, commit or _commit())._asdict() for folder in folders]
+    write_json(pages / "data" / f"{name}.json", {"runs": runs})
+
+
+def load(name: str, pages: Path = PAGES) -> list[Run]:
+    """What is kept under a name."""
+    text = (pages / "data" / f"{name}.json").read_text(encoding="utf-8")
+    return [Run(**run) for run in json.loads(text)["runs"]]
+
+
+def renewed(text: str, pages: Path = PAGES) -> str:
+    """A page whose tables are those of the data."""
+
+    def table(found: re.Match[str]) -> str:
+        runs = load(found[2], pages)
+        return f"{found[1]}\n{TABLES[found[2]](runs)}\n\n{origin(runs)}\n\n{found[3]}"
+
+    return MARKED.sub(table, text)
+
+
+def _kept(folder: Path, commit: str) -> Run:
+    hydra = folder / ".hydra"
+    command = yaml.safe_load((hydra / "hydra.yaml").read_text())["hydra"]["job"]["config_name"]
+    words = yaml.safe_load((hydra / "overrides.yaml").read_text())
+    claims = folder / "claims.json"
+    result = json.loads((claims if claims.is_file() else folder / "result.json").read_text())
+    tables = {}
+    for path in sorted(folder.glob("*.csv")):
+        if path.stat().st_size <= LARGEST:
+            with path.open(newline="", encoding="utf-8") as file:
+                tables[path.stem] = list(csv.DictReader(file))
+    said = " ".join(["torchfovea", command, *(word for word in words if not word.startswith(("picture=", "workers=")))])
+    return Run(said, commit, _machine(), result, tables)
+
+
+def _commit() -> str:
+    def git(*words: str) -> str:
+        return subprocess.run(["git", *words], capture_output=True, text=True, check=True, cwd=PAGES).stdout.strip()
+
+    changed = git("status", "--porcelain", "--", "../../torchfovea", "../../conf")
+    return git("rev-parse", "--short=7", "HEAD") + "+" * bool(changed)
+
+
+def _machine() -> str:
+    python = ".".join(platform.python_version_tuple()[:2])
+    return f"{os.cpu_count()} cores, {platform.machine()}, Python {python}, PyTorch {torch.__version__.split('+')[0]}"
+
+
+def origin(runs: Sequence[Run]) -> str:
+    """Where a table comes from, in a paragraph."""
+    where = " and ".join(dict.fromkeys(f"at {run.commit} on {run.machine}" for run in runs))
+    return f"*{'; '.join(f'`{run.command}`' for run in runs)}: {where}.*"
+
+
+def markdown(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table."""
+    lines = [columns, ["---"] * len(columns), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def settings(run: Run) -> dict[str, str]:
+    """The settings of a run's command."""
+    return dict(word.split("=", 1) for word in run.command.split() if "=" in word)
+
+
+def percent(value: Any, digits: int = 1) -> str:
+    """A share."""
+    return f"{100 * float(value):.{digits}f}%"
+
+
+def mean_with_interval(values: Sequence[float], digits: int = 1) -> str:
+    """A mean with its 95% interval by bootstrap; without one if all agree."""
+    mean = f"{statistics.fmean(values):.{digits + 1}f}"
+    if min(values) == max(values):
+        return mean
+    drawn = torch.tensor(values, dtype=torch.float64)
+    found = bootstrap_interval(drawn, torch.Generator().manual_seed(0))
+    return f"{mean} ({float(found.low):.{digits}f}–{float(found.high):.{digits}f})"
+
+
+def pair(runs: Sequence[Run]) -> str:
+    """A real pair, by matcher and by what the retinas span; in brackets by area."""
+    rows = []
+    for run in runs:
+        given, found = settings(run), run.result
+
+        def both(name: str, found: Mapping[str, Any] = found) -> str:
+            return f"{percent(found[name])} ({percent(found[f'{name}_by_area'])})"
+
+        errors = [f"{1e3 * found[name]:.1f} mm" for name in ("median_error_m", "common_median_error_m")]
+        rows.append(
+            [
+                given.get("span", "whole"),
+                {"sgbm": "SGBM"}.get(given.get("matcher", "sweep"), "sweep"),
+                f"{found['points']:,}",
+                both("valid_fraction"),
+                errors[0],
+                f"{errors[1]}, {1e3 * found['plain_common_median_error_m']:.1f} mm",
+                both("coverage_50"),
+                both("coverage_95"),
+            ]
+        )
+    columns = ("`span`", "matcher", "points", "fields with a point (by area)", "median depth error")
+    beside = "where plain SGBM has one too: ours, plain SGBM"
+    return markdown([*columns, beside, "inside 50% (by area)", "inside 95% (by area)"], rows)
+
+
+def search(runs: Sequence[Run]) -> str:
+    """Searches, each of several episodes."""
+    rows = []
+    for run in runs:
+        given, episodes = settings(run), run.tables["episodes"]
+        found = sum(int(row["found"]) for row in episodes)
+        geometric = given.get("fidelity") == "geometric"
+        matcher = "geometric" if geometric else {"sgbm": "SGBM"}.get(given.get("matcher", "sgbm"), "sweep")
+        layout = given.get("sensor", "log_polar").replace("_", "-")
+        errors = [float(row["target_error_m"]) for row in episodes if row["target_error_m"]]
+        rows.append(
+            [
+                f"{float(given.get('sensor.fov_deg', 135)):.0f}°, {layout}, {matcher}",
+                f"{found} of {len(episodes)}",
+                mean_with_interval([float(row["saccades_to_target"]) for row in episodes]),
+                percent(run.result["phantom_share"]),
+                f"{100 * statistics.median(errors):.1f} cm",
+            ]
+        )
+    named = ("view, retina, matcher", "found", "saccades, mean (95%)", "phantoms", "target error, median")
+    return markdown(named, rows)
+
+
+def rows_of(stem: str, names: Mapping[str, str], form: Callable[[str, str], str]) -> Callable[[Sequence[Run]], str]:
+    """A table that shows columns of the runs' own one.
+
+    Args:
+        stem: of the CSV file.
+        names: from its columns to ours.
+        form: of a column and its cell.
+    """
+
+    def table(runs: Sequence[Run]) -> str:
+        rows = [[form(name, row[name]) for name in names] for run in runs for row in run.tables[stem]]
+        return markdown(list(names.values()), rows)
+
+    return table
+
+
+def claims(runs: Sequence[Run]) -> str:
+    """The paper's claims with their verdicts."""
+    rows = []
+    for claim in (claim for run in runs for claim in run.result):
+        known = claim["estimate"] is not None
+        measured = "{estimate:.3g} ({ci_low:.3g} to {ci_high:.3g})".format(**claim) if known else "–"
+        rows.append([claim["section"], claim["text"], claim["verdict"], measured, str(claim["n"])])
+    return markdown(("Sec.", "the paper's claim", "verdict", "estimate (95%)", "scenes"), rows)
+
+
+def short(name: str, cell: str) -> str:
+    """A cell as it is shown: a share in per cent, another number to three digits, words without underlines."""
+    try:
+        value = float(cell)
+    except ValueError:
+        return cell.replace("log_polar", "log-polar").replace("_", " ") or "–"
+    if name.endswith("share"):
+        return percent(value)
+    return f"{value:,.0f}" if abs(value) >= 100 or value == round(value) else f"{value:#.3g}"
+
+
+FUSION = {
+    "sensor": "sensor", "saccades": "looks", "fusion": "fusion", "range_ratio_median": "estimated/true range",
+    "nees_mean": "range NEES", "z2_median": "median z²", "outlier_share": "outliers",
+}  # fmt: skip
+BENCH = {
+    "path": "path", "work": "work", "median_ms": "ms", "peer": "beside", "peer_median_ms": "its ms", "ratio": "ratio",
+}  # fmt: skip
+
+TABLES: dict[str, Callable[[Sequence[Run]], str]] = {
+    "pair": pair,
+    "search": search,
+    "fusion": rows_of("fusion", FUSION, short),
+    "bench": rows_of("bench", BENCH, short),
+    "claims": claims,
+}
+
+
+def main(words: Sequence[str]) -> int:
+    """Keep runs, or renew or check the pages."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="write nothing")
+    does = parser.add_subparsers(dest="does")
+    keeps = does.add_parser("keep", help="keep what runs left")
+    keeps.add_argument("name", choices=sorted(TABLES))
+    keeps.add_argument("folders", nargs="+", type=Path)
+    keeps.add_argument("--commit", help="of the tree that made them; by default the one here")
+    given = parser.parse_args(words)
+    if given.does == "keep":
+        keep(given.name, given.folders, given.commit)
+    stale = 0
+    for page in sorted(PAGES.glob("*.md")):
+        text = page.read_text(encoding="utf-8")
+        if (new := renewed(text)) != text:
+            stale += 1
+            print(f"{page.name}: {'not what its data say' if given.check else 'renewed'}")
+            if not given.check:
+                page.write_text(new, encoding="utf-8")
+    return stale if given.check else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
