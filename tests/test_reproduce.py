@@ -255,10 +255,18 @@ def test_ablation_and_photometric_cells_are_settings_of_search():
         from hydra.core.hydra_config import HydraConfig
 
         HydraConfig.instance().set_config(cfg)
-        tasks = cells.cells_of(OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"]))
+        plain = OmegaConf.to_container(OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"]), resolve=True)
+        tasks = cells.cells_of(plain)
+        in_far = cells.in_family({**plain, "in_family": "far", "ablation": False, "photometric": False})
+        with pytest.raises(SettingError, match="in_family = near: expected null, or one of far"):
+            cells.in_family({**plain, "in_family": "near"})
+        far = compose("search", overrides=list(cells.cells_of(in_far)[0].overrides))
         wanted = {t.overrides for t in tasks if t.labels["fig"] in ("ablation", "photometric")}
         for overrides in wanted:
             compose("search", overrides=list(overrides))
+    assert {task.labels["scene"] for task in cells.cells_of(in_far)} == {"far"} == {in_far["counts"]["scene"]}
+    # the family's scene and noise, and the reproduction's own sizes
+    assert (far.scene.name, far.budget.match_px, far.saccades) == ("far", 0.3, cfg.saccades)
     assert len(wanted) == len(cfg.ablations) + 1 + 2
     names = [cells.task_name(task) for task in tasks]
     assert len(names) == len(set(names))

@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from hydra.core.global_hydra import GlobalHydra
 
 from torchfovea.commands.shared.build import build_observer, whole
 from torchfovea.commands.shared.composed import compose_search
@@ -19,7 +19,7 @@ from torchfovea.deciding.strategies import upper_confidence_bound
 from torchfovea.episode import Episode
 from torchfovea.setting import require
 
-__all__ = ["METRICS", "CellTask", "cells_of", "regret_convergence", "run_task", "task_name"]
+__all__ = ["METRICS", "CellTask", "cells_of", "in_family", "regret_convergence", "run_task", "task_name"]
 
 METRICS = (
     "gap_final", "gap_per_saccade", "regret_per_saccade", "global_information_per_saccade",
@@ -70,9 +70,24 @@ def _alpha_name(alpha: float) -> str:
     return "ucb_inf" if math.isinf(alpha) else f"ucb_{alpha:g}"
 
 
-def cells_of(cfg: DictConfig) -> list[CellTask]:
-    """All tasks of a reproduction, those that count first."""
-    plain: Any = OmegaConf.to_container(cfg, resolve=True)
+def in_family(plain: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings with `in_family` as the only scene there is, and the one that counts; as they are without it.
+
+    Raises:
+        SettingError: for a family that there is none of.
+    """
+    family = plain["in_family"]
+    if family is None:
+        return dict(plain)
+    known = GlobalHydra.instance().config_loader().get_group_options("family")
+    require(family in known, "in_family", family, "null, or one of " + ", ".join(known))
+    counts = {**plain["counts"], "scene": family}
+    only = {fig: {**plain[fig], "conditions": [counts]} for fig in ("fig8", "fig9")}
+    return {**plain, **only, "counts": counts}
+
+
+def cells_of(plain: Mapping[str, Any]) -> list[CellTask]:
+    """All tasks of a reproduction with these settings, those that count first."""
     require(plain["arms"] in plain["fig8"]["alphas"], "arms", plain["arms"], ", ".join(plain["fig8"]["alphas"]))
     tasks = []
     fig8, wanted = plain["fig8"], plain["conditions"]
@@ -111,10 +126,11 @@ def _tasks(
     curves: tuple[str, ...], changes: Sequence[str] = (),
 ) -> list[CellTask]:  # fmt: skip
     scene, bias, sizes = labels["scene"], labels["bias"], plain["sensor"]
+    group = "scene" if plain["in_family"] is None else "family"
     sample = "null" if sizes["sample"] is None else sizes["sample"]
     memory = "aimed" if bias == "target" and scene != "attention_world" else bias
     overrides = (
-        f"scene={scene}", *plain["scene_overrides"].get(scene, ()), f"reading={labels['reading']}",
+        f"{group}={scene}", *plain["scene_overrides"].get(scene, ()), f"reading={labels['reading']}",
         f"sensor={labels['sensor']}", f"sensor.fov_deg={labels['fov_deg']}", f"memory={memory}",
         f"memory.cells={plain['memory']['cells']}", f"sensor.receptive_fields={sizes['receptive_fields']}",
         f"sensor.sample={sample}", "fidelity=geometric",

@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
 
-from torchfovea.commands.reproduce.cells import METRICS, CellTask, cells_of, run_task, task_name
+from torchfovea.commands.reproduce.cells import METRICS, CellTask, cells_of, in_family, run_task, task_name
 from torchfovea.commands.reproduce.claims import Claim, Verdict, judge_claims, read_claims, rows_where
 from torchfovea.commands.reproduce.fig5 import judge_fig5
 from torchfovea.commands.reproduce.report import decidable, shown, write_report
@@ -44,10 +44,11 @@ def run(cfg: DictConfig) -> float:
     done = finished(cfg, folder, "claims_hold")
     if done is not None:
         return done
-    plain: Any = OmegaConf.to_container(cfg, resolve=True)
+    settings: Any = OmegaConf.to_container(cfg, resolve=True)
+    plain = in_family(settings)
     claims = read_claims(plain["claims"])
     start = time.perf_counter()
-    rows = _episodes(cells_of(cfg), folder / "cells", *workers_of(cfg))
+    rows = _episodes(cells_of(plain), folder / "cells", *workers_of(cfg))
     seconds = time.perf_counter() - start
     write_csv(folder / "episodes.csv", _COLUMNS, [[row[c] for c in _COLUMNS] for row in rows])
     counting = rows_where(rows, plain["counts"])
