@@ -16,9 +16,10 @@ from torchfovea.tuning.baselines import hand, table_1
 from torchfovea.tuning.bias import Shape, decode, features, mixture_of
 from torchfovea.tuning.problem import Problem, evaluate_bias, play
 from torchfovea.tuning.scenes import Distribution, first_surfaces, stream
-from torchfovea.tuning.simulator import Run, Task
+from torchfovea.tuning.simulator import Run
 from torchfovea.tuning.study import Heldout, check_methods, curves
 from torchfovea.tuning.train import Schedule
+from torchfovea.tuning.worlds import Task
 
 NO_TASK = torch.zeros(1, 2)
 
@@ -67,7 +68,7 @@ def test_a_conditioned_mean_follows_the_task(components):
     bias = decode(shape, rivals.fit_vector(shape, u, task, 1.0), task[:5])
     wanted = torch.from_numpy(np.linalg.lstsq(features(task).numpy(), u.numpy(), rcond=None)[0])
     torch.testing.assert_close(bias.means, (features(task[:5]) @ wanted)[:, None].expand(-1, components, -1))
-    assert float(bias.alpha) == pytest.approx(1.0)
+    assert float(bias.weights.alpha) == pytest.approx(1.0)
 
 
 def test_what_cannot_be_fitted_is_named():

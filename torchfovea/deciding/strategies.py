@@ -17,6 +17,8 @@ from torch import Tensor
 from torchfovea.deciding import acquisition, infomax, policies
 from torchfovea.deciding.acquisition import Generators
 from torchfovea.deciding.reward import RewardBelief, inverse_range_from_range
+from torchfovea.deciding.weighted import Terms, Weights, saccades_left, weighted_score
+from torchfovea.memory.classes import class_moments
 from torchfovea.memory.egosphere import Memory
 from torchfovea.sensing.camera import Camera
 from torchfovea.sensing.correspondence import Budget, eye_sigma_px
@@ -41,6 +43,7 @@ __all__ = [
     "thompson",
     "upper_confidence_bound",
     "upper_confidence_bound_less_cost",
+    "weighted",
 ]
 
 
@@ -214,6 +217,44 @@ def information_gain(
     if overhead is not None:
         gain = infomax.per_cost(gain, _cost(view, unit), overhead)
     return gain, state
+
+
+class _Course(NamedTuple):
+    """State of `weighted`: how many decisions are made, and the foresight's own state."""
+
+    made: int
+    foresight: Any
+
+
+def weighted(
+    view: View, weights: Weights, saccades: int, foresight: Strategy | None = None, sought: int | None = None
+) -> tuple[Tensor, _Course]:
+    """The family of `torchfovea.deciding.weighted`: a weighted sum of mean, spread, improvement, information and cost.
+
+    Args:
+        view: what is known; with its memory where what is unseen or of a class has a weight.
+        weights: of the terms.
+        saccades: of the whole search, the initial gaze included.
+        foresight: what tells the information of a fixation, such as `information_gain` with its sensor's law.
+        sought: the class that is sought.
+
+    Raises:
+        SettingError: a weight on what is not known.
+    """
+    made, ahead = (0, None) if view.state is None else view.state
+    unseen = information = doubt = None
+    if view.memory is not None and weights.counts("by_unseen"):
+        fresh = view.eligible & (view.memory.looks == 0)
+        unseen = fresh.sum(-1) / view.eligible.sum(-1).clamp(min=1)
+    if foresight is not None and weights.counts("information"):
+        gain, ahead = evaluate(foresight, view._replace(state=ahead))
+        information = gain / gain.shape[-1]
+    if view.memory is not None and view.memory.classes is not None and sought is not None:
+        doubt = class_moments(view.memory.classes, sought)[1].sqrt()
+    degrees = _cost(view, "degrees") if weights.counts("cost_per_deg") else None
+    left = saccades_left(made, saccades)
+    terms = Terms(view.mean, view.std, view.incumbent, left, unseen, degrees, information, doubt)
+    return weighted_score(weights, terms), _Course(made + 1, ahead)
 
 
 class _Portfolio(NamedTuple):

@@ -22,7 +22,7 @@ from torchfovea.setting import require
 from torchfovea.sim.arenas import GeometricArenas
 from torchfovea.sim.model import Scene
 from torchfovea.sim.truth import truth_of
-from torchfovea.tuning.simulator import check_observer, glance
+from torchfovea.tuning.worlds import check_observer, glance
 
 __all__ = ["CellPlaces", "GeometricPlaces", "PhotometricPlaces", "RobotPlaces", "SearchPlaces"]
 
@@ -119,7 +119,7 @@ class CellPlaces(GeometricPlaces):
     """The same scenes, sensed cell by cell: one noisy inverse range of each cell that both retinas see.
 
     Against the geometric sensor nothing hides anything from an eye, and a cell is a direction rather than a patch; the
-    standard deviation is that of `torchfovea.tuning.simulator.glance`.
+    standard deviation is that of `torchfovea.tuning.worlds.glance`.
     """
 
     def __init__(self, cfg: DictConfig, observer: Observer, cells: Tensor, count: int, first: int) -> None:

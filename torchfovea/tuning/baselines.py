@@ -113,6 +113,8 @@ def _ranges(problem: Problem, start: Tensor) -> tuple[Tensor, Tensor]:
         low, high = torch.cat((low, -narrow)), torch.cat((high, narrow))
     if shape.tune_alpha:
         low, high = torch.cat((low, torch.tensor([-2.0]))), torch.cat((high, torch.tensor([1.0])))
+    if shape.tuned:
+        low, high = (torch.cat((ends, sign * torch.ones(len(shape.tuned)))) for ends, sign in ((low, -1), (high, 1)))
     if shape.fov_deg is not None:
         low, high = torch.cat((low, torch.tensor([-1.0]))), torch.cat((high, torch.tensor([1.3])))
     return low.double(), high.double()

@@ -1,29 +1,29 @@
-"""The numbers that are tuned: a flat vector, the mixture and α that it stands for, and cells drawn from it."""
+"""The numbers that are tuned: a flat vector, and the mixture and weights that it stands for."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from torchfovea.deciding.weighted import Weights
 from torchfovea.memory.sphere import DirectionMixture, Quadrature, deep_tail, fix_gauge, log_radial_moment
-from torchfovea.sensing.head import Head, fixate
 from torchfovea.setting import require
 
 __all__ = [
-    "Bias", "Shape", "decode", "draw_cells", "encode", "features", "fix_vector", "fov_of", "log_density_each",
-    "log_normalizer_each", "mixture_of", "numbers_of", "reachable",
+    "Bias", "Shape", "decode", "encode", "features", "fix_vector", "fov_of", "log_density_each",
+    "log_normalizer_each", "mixture_of", "nudged", "numbers_of", "with_weights",
 ]  # fmt: skip
 
-REACH_RANGE_M = 1.0  # as in `torchfovea.commands.shared.build`: a direction is reachable if its point at 1 m is
 _LOG_DIAGONAL = (-3.0, 1.0)
 _LOG_ALPHA = (-4.0, 4.0)
-_MEAN = 4.0
+# of one number of the vector; what of the weights can be tuned here
+_UNIT = {"by_time": 1.0, "by_unseen": 1.0, "improvement": 1.0, "information": 1.0, "cost_per_deg": 0.01}
+_MEAN = _MOST_WEIGHT = 4.0
 _FOV_DEG = (40.0, 150.0)
-_FEWEST_ACCEPTED = 1e-3
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,10 @@ class Shape:
             polynomial of the task with six coefficients.
         tune_alpha: whether log α is the last number of the vector; else α is `alpha`.
         alpha: of a vector without it.
-        fov_deg: where the sensor's field of view starts if log tan(fov/2) is a number of the vector, after log α; None:
+        fov_deg: where the sensor's field of view starts if log tan(fov/2) is a number of the vector, the last; None:
             it is not tuned.
+        weights: of the acquisition's other terms.
+        tuned: which of these are numbers of the vector, after log α, starting at `weights`.
     """
 
     components: int = 1
@@ -45,6 +47,8 @@ class Shape:
     tune_alpha: bool = True
     alpha: float = 1.0
     fov_deg: float | None = None
+    weights: Weights = field(default_factory=Weights)
+    tuned: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Raise SettingError for values out of range."""
@@ -53,6 +57,13 @@ class Shape:
         fine = self.fov_deg is None or _FOV_DEG[0] <= self.fov_deg <= _FOV_DEG[1]
         require(fine, "sensor.fov_deg", self.fov_deg, f"from {_FOV_DEG[0]:.0f} to {_FOV_DEG[1]:.0f} to be tuned")
         require(math.exp(-4) <= self.alpha <= math.exp(4), "acquisition.alpha", self.alpha, "between 0.0183 and 54.6")
+        for name in self.tuned:
+            known = name in _UNIT and self.tuned.count(name) == 1
+            require(known, "tune_weights", name, "each once, any of " + ", ".join(_UNIT))
+            value, most = getattr(self.weights, name), _MOST_WEIGHT * _UNIT[name]
+            require(abs(value) <= most, f"acquisition.{name}", value, f"from {-most:g} to {most:g} to be tuned")
+        alone = self.weights.numbers["doubt"] == 0
+        require(alone, "acquisition.doubt", self.weights.doubt, "0 in tuning, whose scenes have no classes")
 
     @property
     def numbers(self) -> int:
@@ -67,28 +78,35 @@ class Shape:
     @property
     def size(self) -> int:
         """Of the vector."""
-        return self.body + int(self.tune_alpha) + int(self.fov_deg is not None)
+        return self.body + int(self.tune_alpha) + len(self.tuned) + int(self.fov_deg is not None)
+
+    @property
+    def policy(self) -> slice:
+        """Where the acquisition's numbers are: log α and the tuned weights."""
+        return slice(self.body, self.body + int(self.tune_alpha) + len(self.tuned))
 
     def tail(self, alpha: float, fov_deg: float | None) -> Tensor:
-        """The vector's last numbers."""
+        """The vector's last numbers, with the weights where they start."""
+        first = [math.log(alpha)] if self.tune_alpha else []
+        weights = [getattr(self.weights, name) / _UNIT[name] for name in self.tuned]
         fov = [] if fov_deg is None else [math.log(math.tan(math.radians(fov_deg) / 2))]
-        return torch.tensor(([math.log(alpha)] if self.tune_alpha else []) + fov, dtype=torch.float64)
+        return torch.tensor([*first, *weights, *fov], dtype=torch.float64)
 
 
 class Bias(NamedTuple):
-    """Mixtures, one for each scene or one for all (B = 1), and the exploration weight.
+    """Mixtures, one for each scene or one for all (B = 1), and the acquisition.
 
     Attributes:
         logits: (B, M).
         means: (B, M, 3).
         cholesky: (B, M, 3, 3).
-        alpha: scalar.
+        weights: of the acquisition; those that the vector holds are scalar tensors, as alpha always is.
     """
 
     logits: Tensor
     means: Tensor
     cholesky: Tensor
-    alpha: Tensor
+    weights: Weights
 
 
 def features(task: Tensor) -> Tensor:
@@ -123,7 +141,34 @@ def decode(shape: Shape, vector: Tensor, task: Tensor) -> Bias:
     )
     cholesky = torch.stack([torch.stack(row, -1) for row in rows], -2)
     log_alpha = vector[shape.body].clamp(*_LOG_ALPHA) if shape.tune_alpha else vector.new_tensor(math.log(shape.alpha))
-    return Bias(logits, means, cholesky, log_alpha.exp())
+    ours = vector[shape.policy][int(shape.tune_alpha) :].clamp(-_MOST_WEIGHT, _MOST_WEIGHT)
+    tuned = {name: _UNIT[name] * value for name, value in zip(shape.tuned, ours, strict=True)}
+    return Bias(logits, means, cholesky, replace(shape.weights, alpha=log_alpha.exp(), **tuned))
+
+
+def nudged(shape: Shape, weights: Weights, offset: Tensor) -> Weights:
+    """A policy's weights for K rows, each with its log α and tuned weights moved by an offset (K, P) in the vector."""
+    columns = list(offset.unbind(-1))
+    k, moved = len(offset), {}
+    for name in ("alpha", *shape.tuned):
+        now = getattr(weights, name)
+        if name == "alpha":
+            by = columns.pop(0).to(now).exp() if shape.tune_alpha else now.new_ones(k)
+            moved[name] = now * by
+        else:
+            moved[name] = now + _UNIT[name] * columns.pop(0).to(now)
+    return replace(weights, **moved)
+
+
+def with_weights(shape: Shape, vector: Tensor, **weights: float) -> Tensor:
+    """The same bias with other weights of the acquisition, as far as they are numbers of the vector."""
+    vector = vector.clone()
+    names = (("alpha",) if shape.tune_alpha else ()) + shape.tuned
+    for place, name in enumerate(names):
+        if name in weights:
+            value = math.log(weights[name]) if name == "alpha" else weights[name] / _UNIT[name]
+            vector[shape.body + place] = value
+    return vector
 
 
 def encode(shape: Shape, mixture: DirectionMixture, alpha: float) -> Tensor:
@@ -172,6 +217,8 @@ def fix_vector(shape: Shape, vector: Tensor) -> Tensor:
     vector = vector.clone()
     if shape.tune_alpha:
         vector[shape.body] = vector[shape.body].clamp(*_LOG_ALPHA)
+    ours = slice(shape.policy.start + int(shape.tune_alpha), shape.policy.stop)
+    vector[ours] = vector[ours].clamp(-_MOST_WEIGHT, _MOST_WEIGHT)
     tail = vector[shape.body :]
     if shape.fov_deg is not None:
         tail[-1] = shape.tail(1.0, fov_of(shape, vector))[-1]
@@ -179,92 +226,13 @@ def fix_vector(shape: Shape, vector: Tensor) -> Tensor:
         return vector.clamp(-_MEAN, _MEAN)
     bias = decode(shape, vector, vector.new_zeros(1, 2))
     mixture = DirectionMixture(bias.logits[0], bias.means[0], bias.cholesky[0])
-    return torch.cat((encode(shape, mixture, float(bias.alpha)).to(vector)[: shape.body], tail))
+    return torch.cat((encode(shape, mixture, float(bias.weights.alpha)).to(vector)[: shape.body], tail))
 
 
 def mixture_of(shape: Shape, vector: Tensor, task: Tensor | None = None) -> DirectionMixture:
     """The mixture of a vector, for one task (2,) if it is conditioned."""
     bias = decode(shape, vector, torch.zeros(1, 2).to(vector) if task is None else task[None].to(vector))
     return fix_gauge(DirectionMixture(bias.logits[0], bias.means[0], bias.cholesky[0]))
-
-
-def reachable(head: Head, directions: Tensor) -> Tensor:
-    """Whether the head can fixate points at 1 m in these directions, (..., 3) to bool (...)."""
-    return fixate(head, REACH_RANGE_M * directions)[1]
-
-
-def draw_cells(
-    bias: Bias, scenes: int, cells: int, head: Head, generator: torch.Generator, strict: bool = True
-) -> Tensor:
-    """Draw every scene's cells within reach (B, N, 3), slot by slot.
-
-    Every slot has its own sequence of random numbers and takes its first reachable draw, so that a slightly different
-    bias gives slightly different cells.
-
-    Args:
-        bias: B mixtures, or one for all.
-        scenes: B.
-        cells: N.
-        head: whose reach.
-        generator: random state.
-        strict: whether cells without a reachable draw are an error; else they are zero vectors.
-
-    Raises:
-        SettingError: where hardly any draw is reachable.
-    """
-    dtype, m = bias.means.dtype, bias.means.shape[1]
-    logits, means, factor = (t.detach().expand(scenes, *t.shape[1:]) for t in (bias.logits, bias.means, bias.cholesky))
-    edges = logits.softmax(-1).cumsum(-1)
-    direction = torch.zeros(scenes, cells, 3, dtype=dtype)
-    waiting, tried, block = torch.arange(scenes * cells), 0, 4
-    seed = torch.randint(2**62, (), generator=generator)
-    while len(waiting):
-        counter = waiting * 2**20 + torch.arange(tried, tried + block)[:, None]
-        draws = torch.stack((*_normal(seed + 2, counter, dtype), _normal(seed + 3, counter, dtype)[0]), -1)
-        if len(bias.means) == m == 1:
-            v = means[0, 0] + draws @ factor[0, 0].mT
-        else:
-            scene = (waiting // cells).expand_as(counter)
-            lot = _uniform(seed + 1, counter, dtype)[0]
-            component = (lot[..., None] > edges[scene]).sum(-1).clamp(max=m - 1)
-            v = means[scene, component] + (factor[scene, component] @ draws[..., None])[..., 0]
-        unit = torch.nn.functional.normalize(v, dim=-1)
-        good = reachable(head, unit)
-        tried, block = tried + block, min(2 * block, 64)
-        order = torch.arange(len(good))[:, None]
-        first = torch.where(good, order, len(good)).amin(0)
-        any_good = first < len(good)
-        direction.view(-1, 3)[waiting[any_good]] = unit[first[any_good], any_good.nonzero()[:, 0]]
-        waiting = waiting[~any_good]
-        filled = 1 - len(waiting) / (scenes * cells)
-        # a share s of reachable draws would have filled 1 − (1 − s)^tried by now
-        enough = tried < 512 or filled > 1 - (1 - _FEWEST_ACCEPTED) ** tried
-        enough = enough and tried < 16 / _FEWEST_ACCEPTED
-        if not (strict or enough):
-            break
-        require(
-            enough,
-            "reachable",
-            f"{filled:.1%} of the cells after {tried} draws each",
-            "at least one draw in a thousand within the head's reach: the bias and the reachable set do not overlap",
-        )
-    return direction
-
-
-def _uniform(seed: Tensor, counter: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Two uniform numbers in (0, 1] for each counter: SplitMix64 (Steele, Lea, Flood 2014), any of them at any time."""
-    x = (seed * 0x632BE59BD9B4E019 + counter) * -0x61C8864680B583EB
-    x = (x ^ (x >> 30 & 0x3FFFFFFFF)) * -0x40A7B892E31B1A47
-    x = (x ^ (x >> 27 & 0x1FFFFFFFFF)) * -0x6B2FB644ECCEEE15
-    x = x ^ (x >> 31 & 0x1FFFFFFFF)
-    return ((x & 0xFFFFFFFF).to(dtype) + 0.5) / 2**32, ((x >> 32 & 0xFFFFFFFF).to(dtype) + 0.5) / 2**32
-
-
-def _normal(seed: Tensor, counter: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Two standard normal numbers for each counter (Box and Muller 1958)."""
-    u, v = _uniform(seed, counter, dtype)
-    radius, angle = (-2 * u.log()).sqrt(), 2 * math.pi * v
-    return radius * angle.cos(), radius * angle.sin()
 
 
 def log_density_each(bias: Bias, directions: Tensor) -> Tensor:

@@ -12,7 +12,9 @@ are drawn independently, so that E[∇ log p̃(p_i) f] = 0 for any f that does n
   counterfactual of R − f is unbiased too (but for the quadrature of m).
 - `coverage`: ∇F alone: no run at all. Biased, for F knows cells but no saccades; a warm start.
 
-α and the field of view are not in p̃: their derivatives are central differences with common random numbers.
+α, the acquisition's other weights and the field of view are not in p̃: their derivatives are central differences with
+common random numbers, of the policy's numbers all at once, each scene with signs of its own (Spall 1992), so that many
+cost no more than one. `policy` is these alone, and leaves the bias as it is.
 """
 
 from __future__ import annotations
@@ -22,24 +24,29 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchfovea.tuning.bias import Bias, log_density_each, log_normalizer_each
+from torchfovea.sensing.head import Gaze
+from torchfovea.setting import require
+from torchfovea.tuning.bias import Bias, log_density_each, log_normalizer_each, nudged
 from torchfovea.tuning.problem import Batch, Problem, play, prepare
 from torchfovea.tuning.scenes import Scenes, first_surfaces, nearest_point
-from torchfovea.tuning.simulator import Known, Worlds, blank, simulate
+from torchfovea.tuning.simulator import Resumed, blank, simulate
+from torchfovea.tuning.worlds import Known, Worlds
 
 __all__ = [
     "Credit",
     "Gradient",
-    "alpha_difference",
     "counterfactual",
     "coverage",
     "covered",
     "finish",
     "fov_difference",
+    "policy",
+    "policy_difference",
     "pull",
 ]
 
 _ALPHA_STEP = 0.05  # of log α, to either side: at a kink a wider one averages slopes of both sides
+_WEIGHT_STEP = 0.1  # of the other weights' numbers
 _FOV_STEP = 0.15  # of log tan(fov/2)
 
 
@@ -79,7 +86,7 @@ def pull(problem: Problem, vector: Tensor, batch: Batch, credits: list[Credit]) 
         if shared:
             density = log_density_each(bias, direction[None])[0]
         else:
-            each = Bias(bias.logits[scene], bias.means[scene], bias.cholesky[scene], bias.alpha)
+            each = Bias(bias.logits[scene], bias.means[scene], bias.cholesky[scene], bias.weights)
             density = log_density_each(each, direction[:, None])[:, 0]
         total = total + (weight * density).sum()
         per_scene = per_scene.index_add(0, scene, weight)
@@ -88,21 +95,51 @@ def pull(problem: Problem, vector: Tensor, batch: Batch, credits: list[Credit]) 
     return torch.autograd.grad(total / n, x)[0].double()
 
 
-def alpha_difference(
+def policy_offsets(problem: Problem, batch: Batch, scenes: int) -> Tensor:
+    """Steps of the policy's numbers, with signs of its own for each of the first few scenes, (scenes, P)."""
+    shape = problem.shape
+    steps = [_ALPHA_STEP] * int(shape.tune_alpha) + [_WEIGHT_STEP] * len(shape.tuned)
+    sign = torch.randint(2, (scenes, len(steps)), generator=torch.Generator().manual_seed(batch.seed ^ 0x51B))
+    return (2 * sign - 1).double() * torch.tensor(steps, dtype=torch.float64)
+
+
+def slopes(offsets: Tensor, more: Tensor, less: Tensor) -> Tensor:
+    """What differences (n,) say of each number, moved by offsets (n, P) to either side: (P,)."""
+    return ((more - less).double()[:, None] / (2 * offsets)).mean(0)
+
+
+def policy_difference(
     problem: Problem, vector: Tensor, batch: Batch, world: Worlds, share: float = 1.0
-) -> tuple[float, float]:
-    """Slope in log α by a central difference on the same cells, scenes and noise; and the episodes spent."""
-    if not problem.shape.tune_alpha or share <= 0:
-        return 0.0, 0.0
+) -> tuple[Tensor, float, float]:
+    """Central differences of the policy's numbers on the same cells, scenes and noise.
+
+    Returns:
+        Slopes (P,), the episodes spent, and the mean value of these.
+    """
+    shape = problem.shape
+    numbers = shape.policy.stop - shape.policy.start
+    if numbers == 0 or share <= 0:
+        return torch.zeros(numbers, dtype=torch.float64), 0.0, 0.0
     n = max(1, round(share * len(batch.scenes.nearest_m)))
     part = torch.arange(n)
     scenes, world = batch.scenes.take(part), world.take(part)
-    alpha = problem.bias(vector.detach(), batch.scenes).alpha
+    weights, offsets = problem.bias(vector.detach(), batch.scenes).weights, policy_offsets(problem, batch, n)
     both = torch.cat((part, part))
-    sign = torch.ones(n).to(world.range_m)
-    alphas = alpha * torch.cat((sign, -sign)).mul(_ALPHA_STEP).exp()
-    value = simulate(problem.task, scenes.take(both), world.take(both), alphas).value
-    return float((value[:n] - value[n:]).mean() / (2 * _ALPHA_STEP)), 2.0 * n
+    moved = nudged(shape, weights, torch.cat((offsets, -offsets)))
+    value = simulate(problem.task, scenes.take(both), world.take(both), moved).value
+    return slopes(offsets, value[:n], value[n:]), 2.0 * n, float(value.mean())
+
+
+def policy(problem: Problem, vector: Tensor, batch: Batch, alpha_share: float = 1.0) -> Gradient:
+    """The acquisition's numbers alone, on all scenes; the bias stays."""
+    numbers = problem.shape.policy.stop - problem.shape.policy.start
+    require(numbers > 0, "estimator", "policy", "tune_alpha=true or tune_weights, for it tunes nothing else")
+    gradient = torch.zeros(problem.shape.size, dtype=torch.float64)
+    world = prepare(problem, problem.bias(vector.detach(), batch.scenes), batch)
+    if alpha_share <= 0:  # in a warm start
+        return Gradient(gradient, 0.0, len(batch.scenes.nearest_m), len(batch.scenes.nearest_m))
+    gradient[problem.shape.policy], spent, value = policy_difference(problem, vector, batch, world)
+    return Gradient(gradient, value, spent, round(spent))
 
 
 def fov_difference(problem: Problem, vector: Tensor, batch: Batch, share: float = 1.0) -> tuple[float, float]:
@@ -121,25 +158,23 @@ def finish(
     problem: Problem, vector: Tensor, batch: Batch, world: Worlds, credits: list[Credit], value: Tensor,
     episodes: float, runs: int, alpha_share: float,
 ) -> Gradient:  # fmt: skip
-    """Turn credits into a gradient, and add the slope in log α."""
+    """Turn credits into a gradient, and add the slopes of the policy's numbers."""
     gradient = pull(problem, vector, batch, credits)
-    slope, spent = alpha_difference(problem, vector, batch, world, alpha_share)
-    if problem.shape.tune_alpha:
-        gradient[problem.shape.body] = slope
+    gradient[problem.shape.policy], spent, _ = policy_difference(problem, vector, batch, world, alpha_share)
     return Gradient(gradient, float(value.mean()), episodes + spent, runs + round(spent))
 
 
 class _Removals(NamedTuple):
     """What the cells of B episodes were worth.
 
-    world: of the episodes; value: of them (B,); credit: of every fixated cell; slope: in log α; episodes and runs:
-    spent.
+    world: of the episodes; value: of them (B,); credit: of every fixated cell; slope: of the policy's numbers (P,);
+    episodes and runs: spent.
     """
 
     world: Worlds
     value: Tensor
     credit: Credit
-    slope: float
+    slope: Tensor
     episodes: float
     runs: int
 
@@ -151,49 +186,49 @@ def counterfactual(problem: Problem, vector: Tensor, batch: Batch, alpha_share: 
 
 
 def _gradient(problem: Problem, vector: Tensor, found: _Removals) -> Gradient:
-    if problem.shape.tune_alpha:
-        vector[problem.shape.body] = found.slope
+    vector[problem.shape.policy] = found.slope
     return Gradient(vector, float(found.value.mean()), found.episodes, found.runs)
 
 
 def _removals(problem: Problem, bias: Bias, batch: Batch, alpha_share: float = 0.0) -> _Removals:
-    """Play the batch, then all that is compared with it at once: without each fixated cell, and with other α."""
+    """Play the batch, then all that is compared with it at once: without each fixated cell, and with other weights."""
     task, n = problem.task, len(batch.scenes.nearest_m)
     world = prepare(problem, bias, batch)
-    run = simulate(task, batch.scenes, world, bias.alpha, keep=True)
+    run = simulate(task, batch.scenes, world, bias.weights, keep=True)
     first = torch.full((n, problem.cells + 1), task.saccades)
     times = torch.arange(task.saccades).expand(n, -1)
     # a cell of −1 counts as a last one, dropped
     first = first.scatter_reduce(1, run.cell % (problem.cells + 1), times, "amin")[:, :-1]
     scene, cell = (first < task.saccades).nonzero(as_tuple=True)
-    k, m = len(scene), max(1, round(alpha_share * n)) if problem.shape.tune_alpha and alpha_share > 0 else 0
+    numbers = problem.shape.policy.stop - problem.shape.policy.start
+    k, m = len(scene), max(1, round(alpha_share * n)) if numbers and alpha_share > 0 else 0
     part = torch.arange(m)
     of = torch.cat((scene, part, part))
     made = torch.cat((first[scene, cell] - 1, torch.zeros(2 * m, dtype=torch.long)))
-    steps = torch.cat((torch.zeros(k), torch.full((m,), _ALPHA_STEP), torch.full((m,), -_ALPHA_STEP)))
+    offsets = policy_offsets(problem, batch, m)
+    weights = nudged(problem.shape, bias.weights, torch.cat((offsets.new_zeros(k, numbers), offsets, -offsets)))
     memory = Known(*(torch.stack(parts)[made, of] for parts in zip(*run.memories, strict=True)))
     other = world.take(of)
     other.allowed[torch.arange(k), cell] = False
-    start = (memory, made, run.reward[of])
-    value = simulate(task, batch.scenes.take(of), other, bias.alpha * steps.exp().to(bias.alpha), start).value
-    more, less = value[k : k + m], value[k + m :]
-    slope = float((more - less).mean() / (2 * _ALPHA_STEP)) if m else 0.0
+    start = Resumed(memory, made, run.reward[of], Gaze(*(angle[of] for angle in run.gaze)))
+    value = simulate(task, batch.scenes.take(of), other, weights, start).value
+    slope = slopes(offsets, value[k : k + m], value[k + m :]) if m else offsets.new_zeros(numbers)
     credit = Credit(scene, world.direction[scene, cell], run.value[scene] - value[:k])
     spent = n + float((task.saccades - 1 - made).sum()) / (task.saccades - 1)
     return _Removals(world, run.value, credit, slope, spent, n + k + 2 * m)
 
 
 def coverage(problem: Problem, vector: Tensor, batch: Batch, alpha_share: float = 0.0) -> Gradient:
-    """Gradient of the probability-weighted value of the best can that a cell falls on; plays only what α needs.
+    """Gradient of the probability-weighted value of the best can that a cell falls on; plays only what weights need.
 
     A scene counts as an episode though none is played.
     """
     n = len(batch.scenes.nearest_m)
     value = _values(problem, batch.scenes)
     gradient, total = _coverage(problem, vector, batch.scenes, value)
-    if problem.shape.tune_alpha and alpha_share > 0:
+    if alpha_share > 0:
         world = prepare(problem, problem.bias(vector.detach(), batch.scenes), batch)
-        gradient[problem.shape.body], spent = alpha_difference(problem, vector, batch, world, alpha_share)
+        gradient[problem.shape.policy], spent, _ = policy_difference(problem, vector, batch, world, alpha_share)
         return Gradient(gradient, total, n + spent, n + round(spent))
     return Gradient(gradient, total, n, n)
 

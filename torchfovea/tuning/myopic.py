@@ -7,13 +7,16 @@ import math
 import torch
 from torch import Tensor
 
+from torchfovea.deciding.weighted import Weights
 from torchfovea.metrics import gap
 from torchfovea.sensing.head import Gaze, eyes, fixate
 from torchfovea.setting import require
-from torchfovea.tuning.bias import draw_cells, log_density_each, log_normalizer_each
+from torchfovea.tuning.bias import log_density_each, log_normalizer_each
+from torchfovea.tuning.cells import draw_cells
 from torchfovea.tuning.estimators import Credit, Gradient, finish
 from torchfovea.tuning.problem import Batch, Problem, prepare
-from torchfovea.tuning.simulator import Known, empty, glance, score, simulate, world_of
+from torchfovea.tuning.simulator import score, simulate
+from torchfovea.tuning.worlds import Known, empty, glance, world_of
 
 __all__ = ["myopic"]
 
@@ -43,7 +46,8 @@ def myopic(problem: Problem, vector: Tensor, batch: Batch, alpha_share: float = 
     base_world = prepare(problem, bias, batch)
     slot = torch.randint(problem.cells, (n,), generator=rng)
     base_world.allowed[torch.arange(n), slot] = False
-    base = simulate(task, batch.scenes, base_world, bias.alpha)
+    alone = Weights(bias.weights.alpha)  # a candidate is weighed by α, whatever else counts
+    base = simulate(task, batch.scenes, base_world, bias.weights)
 
     # half of the candidates from the bias, half uniform: the importance weight is at most twice N/Q
     q = problem.quadrature.directions
@@ -88,7 +92,7 @@ def myopic(problem: Problem, vector: Tensor, batch: Batch, alpha_share: float = 
         gained = shown / spread
         measured = 1 / world.range_m + spread.sqrt() * noise[t]
         memory = Known(memory.precision + gained, memory.vector + gained * measured, memory.seen | shown)
-        value = score(task, world, memory, bias.alpha)[0]
+        value = score(task, world, memory, alone)[0]
         rival, cell = base.score.gather(1, pointer + 1), base.cell.gather(1, pointer + 1)
         at_self = (value > rival) | ((value == rival) & torch.isfinite(value) & (slot[:, None] < cell))
         pointer = pointer + (~at_self).long()

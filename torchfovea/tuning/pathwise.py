@@ -12,12 +12,14 @@ import math
 import torch
 from torch import Tensor
 
+from torchfovea.deciding.weighted import Weights
 from torchfovea.sensing.head import eyes, fixate
-from torchfovea.tuning.bias import draw_cells, reachable
-from torchfovea.tuning.estimators import Gradient, alpha_difference
+from torchfovea.tuning.cells import draw_cells, reachable
+from torchfovea.tuning.estimators import Gradient, policy_difference
 from torchfovea.tuning.problem import Batch, Problem, prepare
 from torchfovea.tuning.scenes import Scenes, first_surfaces
-from torchfovea.tuning.simulator import Known, Worlds, blank, empty, look, score, world_of
+from torchfovea.tuning.simulator import blank, score
+from torchfovea.tuning.worlds import Known, Worlds, empty, look, world_of
 
 __all__ = ["panorama", "pathwise"]
 
@@ -81,17 +83,15 @@ def pathwise(problem: Problem, vector: Tensor, batch: Batch, alpha_share: float 
     prior = world_of(task, batch.scenes, hard, batch.noise)
     world = Worlds(cells, 1 / rho, batch.noise, inside, prior.prior_mean, prior.prior_precision)
     reward = -(1 - floor) / rho - floor * task.far_m
-    value = _soft_episode(problem, batch, world, reward, bias.alpha)
+    value = _soft_episode(problem, batch, world, reward, Weights(torch.as_tensor(bias.weights.alpha).detach()))
     slope = torch.autograd.grad(value.mean(), x)[0].double()
     slope = torch.where(torch.isfinite(slope), slope, torch.zeros_like(slope))
-    spent = 0.0
-    if problem.shape.tune_alpha:
-        plain = prepare(problem, problem.bias(vector.detach(), batch.scenes), batch)
-        slope[problem.shape.body], spent = alpha_difference(problem, vector, batch, plain, alpha_share)
+    plain = prepare(problem, problem.bias(vector.detach(), batch.scenes), batch)
+    slope[problem.shape.policy], spent, _ = policy_difference(problem, vector, batch, plain, alpha_share)
     return Gradient(slope, float(value.detach().mean()), n + spent, n + round(spent))
 
 
-def _soft_episode(problem: Problem, batch: Batch, world: Worlds, reward: Tensor, alpha: Tensor) -> Tensor:
+def _soft_episode(problem: Problem, batch: Batch, world: Worlds, reward: Tensor, weights: Weights) -> Tensor:
     """Value of an episode whose fixations are expectations, (B,)."""
     task = problem.task
     gaze, best = blank(task, batch.scenes)
@@ -100,7 +100,7 @@ def _soft_episode(problem: Problem, batch: Batch, world: Worlds, reward: Tensor,
     course = [torch.zeros_like(best)]
     for t in range(task.saccades - 1):
         memory = Known(*look(task, world, memory, eyes(task.observer.head, gaze), t))
-        value, point = score(task, world, memory, alpha.detach())
+        value, point = score(task, world, memory, weights)
         some = torch.isfinite(value).any(-1, keepdim=True)
         policy = torch.where(some, value, torch.zeros_like(value)).div(_TEMPERATURE).softmax(-1)
         gaze = fixate(task.observer.head, (policy[..., None] * point).sum(1))[0]

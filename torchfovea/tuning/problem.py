@@ -12,13 +12,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchfovea.deciding.weighted import joined
 from torchfovea.memory.sphere import Quadrature, sphere_quadrature
 from torchfovea.sensing.camera import Pinhole
 from torchfovea.setting import SettingError, require
-from torchfovea.tuning.bias import Bias, Shape, decode, draw_cells, fov_of, reachable
+from torchfovea.tuning.bias import Bias, Shape, decode, fov_of
+from torchfovea.tuning.cells import draw_cells, reachable
 from torchfovea.tuning.prior_field import PriorField, look_up
 from torchfovea.tuning.scenes import Distribution, Scenes, draw_scenes
-from torchfovea.tuning.simulator import Run, Task, Worlds, check_observer, simulate, world_of
+from torchfovea.tuning.simulator import Run, simulate
+from torchfovea.tuning.worlds import Task, Worlds, check_observer, world_of
 
 __all__ = ["Batch", "Problem", "evaluate_bias", "play", "play_each", "prepare"]
 
@@ -108,26 +111,26 @@ def play(problem: Problem, vector: Tensor, batch: Batch, strict: bool = True) ->
     """The episodes of a batch with the hard policy; the same batch gives the same episodes. See `prepare`."""
     problem = problem.at(vector)
     bias = problem.bias(vector.detach(), batch.scenes)
-    return simulate(problem.task, batch.scenes, prepare(problem, bias, batch, strict), bias.alpha)
+    return simulate(problem.task, batch.scenes, prepare(problem, bias, batch, strict), bias.weights)
 
 
 def play_each(problem: Problem, vectors: Sequence[Tensor], batch: Batch) -> list[float]:
     """Mean value of a batch for each of several vectors, as `play` has it, all at once; −1 for one out of reach."""
     if problem.shape.fov_deg is not None:  # every vector has a sensor of its own
         return [_value(problem, vector, batch) for vector in vectors]
-    worlds, alphas, found = [], [], [-1.0] * len(vectors)
+    worlds, weights, found = [], [], [-1.0] * len(vectors)
     inside = []
     n = len(batch.scenes.nearest_m)
     for k, vector in enumerate(vectors):
         bias = problem.bias(vector.detach(), batch.scenes)
         with suppress(SettingError):
             worlds.append(prepare(problem, bias, batch))
-            alphas.append(bias.alpha.expand(n))
+            weights.append(bias.weights.each(lambda weight: weight.expand(n)))
             inside.append(k)
     if inside:
         together = Worlds(*(torch.cat(parts, 1 if i == 2 else 0) for i, parts in enumerate(zip(*worlds, strict=True))))
         scenes = batch.scenes.take(torch.arange(n).repeat(len(inside)))
-        value = simulate(problem.task, scenes, together, torch.cat(alphas)).value
+        value = simulate(problem.task, scenes, together, joined(weights)).value
         for k, mean in zip(inside, value.reshape(-1, n).mean(1).tolist(), strict=True):
             found[k] = mean
     return found

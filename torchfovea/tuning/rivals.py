@@ -17,7 +17,7 @@ from torch import Tensor
 from torchfovea.memory.sphere import DirectionMixture
 from torchfovea.sensing.head import cyclopean
 from torchfovea.setting import SettingError, require
-from torchfovea.tuning.bias import Shape, encode, features, numbers_of
+from torchfovea.tuning.bias import Shape, encode, features, numbers_of, with_weights
 from torchfovea.tuning.problem import Problem, evaluate_bias, play, play_each
 from torchfovea.tuning.scenes import Scenes, nearest_point, stream
 from torchfovea.tuning.simulator import Run
@@ -130,10 +130,7 @@ def _mixture(v: Tensor, components: int) -> DirectionMixture:
 
 def with_alpha(shape: Shape, vector: Tensor, alpha: float) -> Tensor:
     """The same bias with another α; the same vector where α is none of its numbers."""
-    vector = vector.clone()
-    if shape.tune_alpha:
-        vector[shape.body] = math.log(alpha)
-    return vector
+    return with_weights(shape, vector, alpha=alpha)
 
 
 def best_alpha(problem: Problem, vector: Tensor, scenes: int, alphas: Sequence[float] = ALPHAS) -> tuple[Tensor, float]:

@@ -1,11 +1,4 @@
-"""A fast, batched, cell-centric simulator of visual search, with the hard policy.
-
-In a saccade each cell that both retinas see gets *one* noisy inverse range, measured on its own direction, and keeps a
-scalar Gaussian belief of it. Removing or adding a cell changes no other cell's observations, which is what makes the
-counterfactual gradient exact here. Against the full simulator there is no occlusion between the eyes, no poles and no
-furniture, no pooling of receptive fields and no patch scatter; the standard deviation of an observation is that of
-`torchfovea.sensing.triangulation.observe` to first order.
-"""
+"""A fast, batched, cell-centric simulator of visual search, with the hard policy."""
 
 from __future__ import annotations
 
@@ -15,78 +8,51 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchfovea.deciding.acquisition import upper_confidence_bound
+from torchfovea.deciding.infomax import information_gain, precision_by_eccentricity, saccade_degrees
 from torchfovea.deciding.reward import RewardBelief, range_from_inverse_range
-from torchfovea.gaussian import columns
+from torchfovea.deciding.strategies import inverse_range_acuity
+from torchfovea.deciding.weighted import Terms, Weights, saccades_left, weighted_score
 from torchfovea.metrics import gap
-from torchfovea.perception import Observer
 from torchfovea.sensing.camera import Pinhole
-from torchfovea.sensing.correspondence import eye_sigma_px
-from torchfovea.sensing.head import Eyes, Gaze, cyclopean, eyes, fixate, rig_frame
+from torchfovea.sensing.head import Gaze, cyclopean, eyes, fixate
 from torchfovea.setting import require
 from torchfovea.tuning.scenes import Scenes, first_surfaces
+from torchfovea.tuning.worlds import Known, Task, Worlds, empty, look
 
-__all__ = [
-    "Known", "Run", "Task", "Worlds", "best_cell", "blank", "check_observer", "empty", "glance", "look", "score",
-    "simulate", "true_reward", "world_of", "worth",
-]  # fmt: skip
+__all__ = ["Moment", "Resumed", "Run", "best_cell", "blank", "score", "simulate", "true_reward", "worth"]
 
 _FAR_M = 1000.0
+_ANGLES = 512  # of the table of what a fixation brings
 
 
-class Task(NamedTuple):
-    """What an episode is made of besides the cells.
-
-    Attributes:
-        observer: the fixed parts; its acquisition is not used.
-        saccades: T, the initial gaze included.
-        far_m: what a fixation on the floor counts as.
-        metric: what an episode is worth: gap_per_saccade or gap_final.
-    """
-
-    observer: Observer
-    saccades: int = 10
-    far_m: float = 6.0
-    metric: str = "gap_per_saccade"
-
-
-class Worlds(NamedTuple):
-    """Cells in their scenes.
+class Moment(NamedTuple):
+    """What a decision weighs besides the memory, as far as it has a weight.
 
     Attributes:
-        direction: unit (B, N, 3).
-        range_m: true range from E, (B, N).
-        noise: standard normal draws of every cell's observation in every saccade, (T, B, N).
-        allowed: cells that exist, bool (B, N); the others are never fixated.
-        prior_mean: inverse range believed before the cell is seen, (B, N) [1/m].
-        prior_precision: (B, N) [m²].
+        left: share of the saccades that are left.
+        axis: where the head looks, unit (B, 3).
+        precision: what a fixation of each cell would bring every other, (B, N, N) [m²].
     """
 
-    direction: Tensor
-    range_m: Tensor
-    noise: Tensor
-    allowed: Tensor
-    prior_mean: Tensor
-    prior_precision: Tensor
-
-    def take(self, index: Tensor) -> Worlds:
-        """The episodes of an index (K,), copied."""
-        d, r, n, a, m, p = self
-        return Worlds(d[index], r[index], n[:, index], a[index], m[index], p[index])
+    left: float = 0.5
+    axis: Tensor | None = None
+    precision: Tensor | None = None
 
 
-class Known(NamedTuple):
-    """Scalar information filters of inverse range.
+class Resumed(NamedTuple):
+    """Where episodes begin later.
 
     Attributes:
-        precision: (B, N).
-        vector: precision times mean, (B, N).
-        seen: bool (B, N).
+        memory: before the decision, (B, N).
+        made: decisions already made t ≥ 0, (B,) int64.
+        reward: so far (B, T), of which the first t + 1 count.
+        gaze: so far, angles (B, T), likewise.
     """
 
-    precision: Tensor
-    vector: Tensor
-    seen: Tensor
+    memory: Known
+    made: Tensor
+    reward: Tensor
+    gaze: Gaze
 
 
 class Run(NamedTuple):
@@ -109,95 +75,22 @@ class Run(NamedTuple):
     memories: list[Known]
 
 
-def check_observer(observer: Observer) -> None:
-    """Raise SettingError for an observer that this simulator does not model."""
-    pinhole = isinstance(observer.camera, Pinhole)
-    require(pinhole, "sensor.camera", type(observer.camera).__name__, "pinhole, in tuning")
-    require(observer.fusion.chart == "inverse_range", "fusion", observer.fusion.name, "inverse_range, in tuning")
-
-
-def empty(world: Worlds) -> Known:
-    """Nothing seen yet."""
-    none = torch.zeros_like(world.allowed)
-    return Known(world.prior_precision, world.prior_precision * world.prior_mean, none)
-
-
-def world_of(task: Task, scenes: Scenes, cells: Tensor, noise: Tensor) -> Worlds:
-    """Put cells (B, N, 3) into B scenes, with noise (T, B, N)."""
-    hits = first_surfaces(scenes, torch.zeros_like(cells[:, :1]), cells)
-    prior = task.observer.prior
-    mean = torch.full_like(hits.range_m, prior.mean)
-    precision = torch.full_like(mean, prior.std**-2)
-    return Worlds(cells, hits.range_m, noise, torch.ones_like(hits.floor), mean, precision)
-
-
-def glance(observer: Observer, pose: Eyes, point: Tensor, direction: Tensor, range_m: Tensor) -> tuple[Tensor, Tensor]:
-    """Which points both retinas see, and the variance of their inverse range, to first order.
-
-    In the rig's frame, with slopes u = x/z and v = y/z of the eyes' rays, the point is Z ((u + u')/2, (v + v')/2, 1)
-    about the baseline's middle with Z = b/(u − u'), as in `torchfovea.sensing.triangulation.triangulate_rectified`; the
-    noise of each retina reaches the slopes through its eye's rotation.
-
-    Args:
-        observer: camera, retina and error budget.
-        pose: of the eyes, (B, ...).
-        point: (B, N, 3) in E [m].
-        direction: of the points from E, unit (B, N, 3).
-        range_m: (B, N).
-
-    Returns:
-        bool (B, N) and (B, N) [1/m²], finite everywhere. Differentiable.
-    """
-    focal, retina = observer.camera.focal_px, observer.retina
-    frame, middle, baseline = rig_frame(pose)
-    half = baseline[..., None] / 2
-    x, y, z = ((point - middle.unsqueeze(-2)) @ frame).unbind(-1)
-    ux, uy, uz = (direction @ frame).unbind(-1)
-    ahead = z > 1e-3
-    depth = torch.where(ahead, z, torch.ones_like(z))
-    v = y / depth
-    # of the range: by the slopes' mean and by their difference
-    along = ux * x + uy * y + uz * depth
-    by_mean, by_disparity, by_v = depth * ux / 2, depth * along / (2 * half), depth * uy / 2
-    visible = ahead
-    spread = torch.zeros_like(range_m)
-    for rotation, centre, sign in ((pose.R_left, pose.t_left, 1.0), (pose.R_right, pose.t_right, -1.0)):
-        cx, cy, cz = ((point - centre.unsqueeze(-2)) @ rotation).unbind(-1)
-        forward = cz > 1e-3
-        distance = torch.where(forward, cz, torch.ones_like(cz))
-        px = focal * columns(cx / distance, cy / distance)
-        visible = visible & forward & retina.inside(px)
-        sigma = eye_sigma_px(observer.budget, retina, px) / focal * (distance / depth)
-        u, by_u = (x + sign * half) / depth, by_mean - sign * by_disparity
-        turned = frame.mT @ rotation
-        for axis in (0, 1):
-            ax, ay, az = (turned[..., k, axis, None] for k in range(3))
-            spread = spread + (sigma * (by_u * (ax - u * az) + by_v * (ay - v * az))).square()
-    return visible, (spread / range_m.square().square()).clamp(min=1e-12)
-
-
-def look(task: Task, world: Worlds, memory: Known, pose: Eyes, t: int) -> Known:
-    """Fuse one saccade's observations into the memory."""
-    point = world.direction * world.range_m[..., None]
-    visible, variance = glance(task.observer, pose, point, world.direction, world.range_m)
-    weight = visible / variance
-    measured = 1 / world.range_m + variance.sqrt() * world.noise[t]
-    return Known(memory.precision + weight, memory.vector + weight * measured, memory.seen | visible)
-
-
-def score(task: Task, world: Worlds, memory: Known, alpha: Tensor) -> tuple[Tensor, Tensor]:
-    """Upper confidence bound of every cell.
+def score(
+    task: Task, world: Worlds, memory: Known, weights: Weights, moment: Moment | None = None
+) -> tuple[Tensor, Tensor]:
+    """Score of every cell.
 
     Args:
         task: with the reward's kind.
         world: the cells.
         memory: their beliefs.
-        alpha: (B,) or a scalar.
+        weights: of the acquisition, numbers or (B,).
+        moment: what it weighs besides; None: half-way, without what has to be known for cost and information.
 
     Returns:
         Scores (B, N), −inf where not eligible, and the believed points (B, N, 3).
     """
-    observer = task.observer
+    observer, moment = task.observer, moment or Moment()
     mean, std = memory.vector / memory.precision, memory.precision.rsqrt()
     reward = RewardBelief(mean, std)
     if observer.reward == "range":
@@ -211,8 +104,22 @@ def score(task: Task, world: Worlds, memory: Known, alpha: Tensor) -> tuple[Tens
     height = height - limits.ground_sigmas * std * range_m * point[..., 2].abs()
     ground = memory.seen & (height < limits.ground_z_m)
     eligible = world.allowed & reachable & (range_m > limits.nearest_m) & ~ground
-    value = upper_confidence_bound(reward.mean, reward.std, alpha.to(mean).expand(mean.shape[:1]))
-    return torch.where(eligible, value, torch.full_like(value, -math.inf)), point
+    lowest = torch.full_like(mean, -math.inf)
+    terms = Terms(reward.mean, reward.std, reward.mean[..., 0], moment.left)
+    if weights.counts("improvement"):
+        best = torch.where(eligible & memory.seen, reward.mean, lowest).amax(-1)
+        best = torch.where(torch.isfinite(best), best, torch.where(eligible, reward.mean, lowest).amax(-1))
+        terms = terms._replace(incumbent=torch.where(torch.isfinite(best), best, torch.zeros_like(best)))
+    if weights.counts("by_unseen"):
+        share = (eligible & ~memory.seen).sum(-1).to(mean) / eligible.sum(-1).clamp(min=1)
+        terms = terms._replace(unseen=share)
+    if weights.counts("cost_per_deg") and moment.axis is not None:
+        terms = terms._replace(degrees=saccade_degrees(moment.axis, world.direction))
+    if weights.counts("information") and moment.precision is not None:
+        gain = information_gain(1 / memory.precision, moment.precision, eligible) / mean.shape[-1]
+        terms = terms._replace(information=gain)
+    value = weighted_score(weights, terms)
+    return torch.where(eligible, value, lowest), point
 
 
 def best_cell(value: Tensor) -> tuple[Tensor, Tensor]:
@@ -246,19 +153,35 @@ def blank(task: Task, scenes: Scenes) -> tuple[Gaze, Tensor]:
     return gaze, true_reward(task, scenes, Gaze(*(a[:, None] for a in gaze)))[:, 0]
 
 
-def worth(task: Task, reward: Tensor, nearest_m: Tensor) -> Tensor:
-    """The task's metric of rewards (..., T) in scenes whose nearest point is at nearest_m (...)."""
+def _rows(weights: Weights, part: slice | Tensor) -> Weights:
+    return weights.each(lambda weight: weight[part])
+
+
+def worth(task: Task, reward: Tensor, nearest_m: Tensor, gaze: Gaze | None = None) -> Tensor:
+    """The task's metric of rewards (..., T), the nearest point at nearest_m (...), less what the gazes cost."""
     course = gap(reward, -nearest_m)
-    return course[..., -1] if task.metric == "gap_final" else course.mean(-1)
+    value = course[..., -1] if task.metric == "gap_final" else course.mean(-1)
+    if task.saccade_cost == 0 or gaze is None:
+        return value
+    axis = cyclopean(task.observer.head, gaze)[0][..., 2]
+    return value - task.saccade_cost * saccade_degrees(axis[..., :-1, :], axis[..., 1:, None, :])[..., 0].mean(-1)
+
+
+def foreseen(task: Task, world: Worlds) -> Tensor:
+    """What precision of inverse range a fixation of each cell would bring every other, by eccentricity: (B, N, N)."""
+    observer = task.observer
+    assert isinstance(observer.camera, Pinhole)
+    half_view = math.atan(observer.retina.radius_px / observer.camera.focal_px)
+    law = inverse_range_acuity(observer.camera, observer.retina, observer.budget, observer.head.baseline_m)
+    angles = torch.linspace(0, half_view, _ANGLES, dtype=world.direction.dtype)
+    table = law(angles)
+    return precision_by_eccentricity(
+        world.direction, world.direction, lambda a: table[(a / half_view * (_ANGLES - 1)).round().long()], half_view
+    )
 
 
 def simulate(
-    task: Task,
-    scenes: Scenes,
-    world: Worlds,
-    alpha: Tensor,
-    start: tuple[Known, Tensor, Tensor] | None = None,
-    keep: bool = False,
+    task: Task, scenes: Scenes, world: Worlds, weights: Weights, start: Resumed | None = None, keep: bool = False
 ) -> Run:
     """Run B episodes with the hard policy.
 
@@ -266,9 +189,8 @@ def simulate(
         task: what an episode is.
         scenes: B of them.
         world: their cells.
-        alpha: exploration, (B,) or a scalar.
-        start: to begin at a decision: memory before it, (B, N); decisions already made t ≥ 0, (B,) int64; rewards so
-            far (B, T), of which the first t + 1 count. Runs later in their episode wait for the others.
+        weights: of the acquisition; tensors are scalars or (B,).
+        start: to begin at a decision; runs later in their episode wait for the others.
         keep: keep the memories before each decision.
 
     Same arguments, same episodes. Not differentiable: the policy is an argmax.
@@ -280,15 +202,17 @@ def simulate(
     scores = torch.full((n, steps), -math.inf, dtype=zero.dtype)
     angles = torch.zeros(3, n, steps, dtype=zero.dtype)
     memories: list[Known] = []
-    alpha = alpha.to(zero).expand(n)
+    weights = weights.each(lambda weight: weight.to(zero).expand(n))
     if start is None:
         memory = look(task, world, empty(world), eyes(task.observer.head, Gaze(zero, zero, zero)), 0)
         order, made = torch.arange(n), torch.zeros(n, dtype=torch.long)
     else:
-        memory, made, earlier = start
+        memory, made = start.memory, start.made
         order = made.argsort(stable=True)  # those that begin first come first: the live ones are a slice
         memory, world = Known(*(m[order] for m in memory)), world.take(order)
-        alpha, made = alpha[order], made[order]
+        weights, made = _rows(weights, order), made[order]
+        angles = torch.stack(start.gaze)[:, order] * (torch.arange(steps) <= made[:, None])
+    precision = foreseen(task, world) if weights.counts("information") else None
     for t in range(steps - 1):
         live = int((made <= t).sum())
         if live == 0:
@@ -298,7 +222,11 @@ def simulate(
         m = memory if live == n else Known(*(f[part] for f in memory))
         if keep:
             memories.append(m)
-        value, point = score(task, w, m, alpha[part])
+        axis = None
+        if weights.counts("cost_per_deg"):
+            axis = cyclopean(task.observer.head, Gaze(*angles[:, part, t]))[0][..., 2]
+        moment = Moment(saccades_left(t, steps), axis, None if precision is None else precision[part])
+        value, point = score(task, w, m, _rows(weights, part), moment)
         best, cell = best_cell(value)
         chosen = point.gather(1, cell.clamp(min=0)[:, None, None].expand(-1, 1, 3))[:, 0]
         now = Gaze(*(angle * (cell >= 0) for angle in fixate(task.observer.head, chosen)[0]))
@@ -311,5 +239,5 @@ def simulate(
     cells, scores, gaze, made = cells[back], scores[back], Gaze(*angles[:, back]), made[back]
     reward = true_reward(task, scenes, gaze)
     if start is not None:
-        reward = torch.where(torch.arange(steps) > made[:, None], reward, earlier)
-    return Run(worth(task, reward, scenes.nearest_m), reward, cells, scores, gaze, memories)
+        reward = torch.where(torch.arange(steps) > made[:, None], reward, start.reward)
+    return Run(worth(task, reward, scenes.nearest_m, gaze), reward, cells, scores, gaze, memories)

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchfovea.files import write_tensors
 from torchfovea.setting import SettingError, require
 from torchfovea.tuning.bias import fix_vector
-from torchfovea.tuning.estimators import Gradient, counterfactual, coverage, covered, fov_difference
+from torchfovea.tuning.estimators import Gradient, counterfactual, coverage, covered, fov_difference, policy
 from torchfovea.tuning.myopic import myopic
 from torchfovea.tuning.pathwise import pathwise
 from torchfovea.tuning.problem import Batch, Problem, evaluate_bias
@@ -30,6 +30,7 @@ ESTIMATORS: dict[str, Callable[..., Gradient]] = {
     "coverage": coverage,
     "myopic": myopic,
     "pathwise": pathwise,
+    "policy": policy,
 }
 
 
@@ -55,7 +56,7 @@ class Schedule:
         warm_estimator: a cheaper one.
         rate: Adam's first step size; it falls linearly to `last_rate`.
         last_rate: at the end of the budget.
-        alpha_share: of a minibatch's scenes, for the derivative in log α.
+        alpha_share: of a minibatch's scenes, for the derivatives in log α and the other weights.
         validations: how many times the vector is judged, evenly spread over the budget, besides the start.
         validation_scenes: the same ones each time.
         seed: of the training scenes; validation scenes are the same for all seeds.
@@ -205,7 +206,7 @@ def _signature(schedule: Schedule, problem: Problem) -> dict[str, Any]:
     del task["observer"]
     # all of the observer but its strategy, a function, which a checkpoint cannot hold and the simulator has its own of
     parts = {f.name: repr(getattr(observer, f.name)) for f in fields(observer) if f.name != "acquisition"}
-    return {"schedule": asdict(schedule), "shape": asdict(problem.shape), "cells": problem.cells,
+    return {"schedule": asdict(schedule), "shape": repr(problem.shape), "cells": problem.cells,
             "distribution": asdict(problem.distribution), **task, **parts}  # fmt: skip
 
 

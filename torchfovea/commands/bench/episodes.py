@@ -14,12 +14,14 @@ from omegaconf import DictConfig, OmegaConf
 from torchfovea.commands.bench.timing import Path, Peer, same
 from torchfovea.commands.shared.build import build_arena, build_cells, build_scene_of, number, whole
 from torchfovea.commands.shared.rollout import roll_out
+from torchfovea.deciding.weighted import Weights
 from torchfovea.perception import Observer, Step, decide, new_memory, perceive
 from torchfovea.sensing.camera import image_camera
 from torchfovea.sensing.head import Gaze, eyes
 from torchfovea.sim import gl, rays
 from torchfovea.tuning.scenes import Distribution, draw_scenes
-from torchfovea.tuning.simulator import Task, Worlds, simulate, world_of
+from torchfovea.tuning.simulator import simulate
+from torchfovea.tuning.worlds import Task, Worlds, world_of
 
 __all__ = ["episode", "photometric_saccade", "picture", "tuning_episode"]
 
@@ -115,15 +117,15 @@ def tuning_episode(cfg: DictConfig, observer: Observer) -> Path:
     directions = build_cells(few, observer.head, generator).reshape(episodes, cells, 3)
     noise = torch.randn(task.saccades, episodes, cells, generator=generator)
     world = world_of(task, scenes, directions, noise)
-    alpha = torch.ones(())
+    weights = Weights(torch.ones(()))
     part = [torch.tensor([b]) for b in range(min(8, episodes))]
     singles: list[tuple[Any, Worlds]] = [(scenes.take(one), world.take(one)) for one in part]
 
     def alone() -> torch.Tensor:
-        return torch.cat([simulate(task, *single, alpha).value for single in singles])
+        return torch.cat([simulate(task, *single, weights).value for single in singles])
 
     def together() -> torch.Tensor:
-        return simulate(task, scenes, world, alpha).value
+        return simulate(task, scenes, world, weights).value
 
     def check() -> None:
         same("tune", together()[: len(part)], alone(), 1e-4, 0.99)

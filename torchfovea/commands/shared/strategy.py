@@ -14,6 +14,7 @@ from torch import Tensor
 from torchfovea.commands.shared.named import build_named, name_of
 from torchfovea.deciding import strategies
 from torchfovea.deciding.strategies import Strategy, View
+from torchfovea.deciding.weighted import Weights
 from torchfovea.perception import Observer
 from torchfovea.search import StopRule
 from torchfovea.setting import require
@@ -29,6 +30,7 @@ __all__ = [
     "read_number",
     "ucb",
     "ucb_cost",
+    "weighted",
 ]
 
 FORM = "a function of a View that returns a score for each cell"
@@ -159,6 +161,20 @@ def infomax(observer: Observer, overhead: float | None = None, unit: str = "degr
         in_range=observer.reward == "range",
         overhead=None if overhead is None else _overhead(overhead),
         unit=_unit(unit),
+    )
+
+
+def weighted(observer: Observer, saccades: int, **weights: float) -> Strategy:
+    """The family of acquisitions with weights, over a search of so many saccades."""
+    given = Weights(**weights)
+    classes = observer.classes
+    require(not given.counts("doubt") or classes is not None, "acquisition.doubt", given.doubt, "0 without classes")
+    return partial(
+        strategies.weighted,
+        weights=given,
+        saccades=int(_number(saccades, "saccades", "a whole number of at least 1", 1)),
+        foresight=infomax(observer) if given.counts("information") else None,
+        sought=None if classes is None else classes.sought,
     )
 
 

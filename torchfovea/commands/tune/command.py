@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shutil
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +22,15 @@ from torchfovea.commands.shared.unread import refuse_unread
 from torchfovea.commands.tune.files import write_memory, write_scenes
 from torchfovea.commands.tune.judge import build_start, judge_policies, move_start
 from torchfovea.commands.tune.study import check_study, study_curves, study_gradients
+from torchfovea.deciding.weighted import Weights
 from torchfovea.files import write_csv
 from torchfovea.setting import require
 from torchfovea.tuning.bias import Shape, fov_of
 from torchfovea.tuning.problem import Problem
 from torchfovea.tuning.scenes import Distribution
-from torchfovea.tuning.simulator import Task
 from torchfovea.tuning.study import Heldout, Row
 from torchfovea.tuning.train import Schedule, State, train
+from torchfovea.tuning.worlds import Task
 
 __all__ = ["build_problem", "run"]
 
@@ -60,14 +61,29 @@ def build_problem(cfg: DictConfig) -> Problem:
             known = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
             require(known, "distribution.regions", region, "four numbers of degrees")
     distribution = replace(construct(Distribution, node, "distribution"), regions=tuple(map(tuple, regions)))
-    task = Task(build_observer(cfg), whole(cfg, "saccades", 2), number(cfg, "far_m"), str(cfg.metric))
-    require(cfg.acquisition.name == "ucb", "acquisition", cfg.acquisition.name, "ucb, whose alpha is tuned")
+    cost = read_number(cfg, "saccade_cost", "worth per degree, at least 0", 0.0)
+    task = Task(build_observer(cfg), whole(cfg, "saccades", 2), number(cfg, "far_m"), str(cfg.metric), cost)
+    known = cfg.acquisition.name in ("ucb", "weighted")
+    require(known, "acquisition", cfg.acquisition.name, "ucb, whose alpha is tuned, or weighted")
+    weights, tuned = _weights(cfg)
     alpha = read_number(cfg, "acquisition.alpha", "a number of at least 0", 0.0)
     for setting in ("tune_alpha", "tune_fov", "prior_field"):
         require(isinstance(cfg[setting], bool), setting, cfg[setting], "true or false")
     fov_deg = float(cfg.sensor.fov_deg) if cfg.tune_fov else None
-    shape = Shape(whole(cfg, "components"), distribution.conditioned, cfg.tune_alpha, alpha, fov_deg)
+    components = whole(cfg, "components")
+    shape = Shape(components, distribution.conditioned, cfg.tune_alpha, alpha, fov_deg, weights, tuned)
     return Problem(task, distribution, shape, whole(cfg, "memory.cells", 2))
+
+
+def _weights(cfg: DictConfig) -> tuple[Weights, tuple[str, ...]]:
+    """The acquisition's weights besides α, and which of them are tuned."""
+    require(OmegaConf.is_list(cfg.tune_weights), "tune_weights", cfg.tune_weights, "a list, [...]")
+    tuned = tuple(str(name) for name in cfg.tune_weights)
+    if cfg.acquisition.name == "ucb":
+        require(not tuned, "tune_weights", list(tuned), "[] without acquisition=weighted")
+        return Weights(), ()
+    names = [field.name for field in fields(Weights)]
+    return replace(Weights(**{name: cfg.acquisition[name] for name in names}), alpha=1.0), tuned
 
 
 def run(cfg: DictConfig) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import fields
 from pathlib import Path
 
 import torch
@@ -27,7 +28,11 @@ def memory_yaml(problem: Problem, vector: Tensor, task: Tensor | None, note: str
 
 def write_memory(problem: Problem, vector: Tensor, folder: Path, name: str = "tuned", how: str = "Tuned on") -> None:
     """A vector as files for `search --config-dir FOLDER memory=NAME`; a conditioned one for nine tasks."""
-    alpha = float(decode(problem.shape, vector, torch.zeros(1, 2, dtype=torch.float64)).alpha)
+    weights = decode(problem.shape, vector, torch.zeros(1, 2, dtype=torch.float64)).weights
+    told = {field.name: float(getattr(weights, field.name)) for field in fields(weights)}
+    plain = not any(value for name, value in told.items() if name != "alpha")
+    given = [f"acquisition.{name}={value:.4g}" for name, value in told.items() if name == "alpha" or value]
+    acquisition = " ".join(given if plain else ["acquisition=weighted", *given])
     own, observer = problem.distribution, problem.at(vector).task.observer
     fov_deg = 2 * math.degrees(math.atan(observer.retina.radius_px / observer.camera.focal_px))
     tasks: dict[str, Tensor | None] = {"": None}
@@ -35,7 +40,7 @@ def write_memory(problem: Problem, vector: Tensor, folder: Path, name: str = "tu
         tasks = {f"_task_{a:+.0f}_{e:+.0f}": torch.tensor([a, e]) for a, e in _CORNERS}
     for suffix, task in tasks.items():
         use = f"search --config-dir THIS_RUNS_FOLDER memory={name}{suffix} scene={own.name}{suffix}"
-        note = f"{how} {own.name}: torchfovea {use} acquisition.alpha={alpha:.4g} sensor.fov_deg={fov_deg:.4g}"
+        note = f"{how} {own.name}: torchfovea {use} {acquisition} sensor.fov_deg={fov_deg:.4g}"
         with replacing(folder / "memory" / f"{name}{suffix}.yaml") as temporary:
             temporary.write_text(memory_yaml(problem, vector, task, note, f"{name}{suffix}"), encoding="utf-8")
 

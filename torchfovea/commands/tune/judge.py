@@ -16,7 +16,8 @@ from torchfovea.memory.sphere import direction_mixture, sphere_quadrature
 from torchfovea.setting import require
 from torchfovea.studies.significance import bootstrap_interval
 from torchfovea.tuning.baselines import TABLE_1, hand, table_1
-from torchfovea.tuning.bias import Shape, encode, reachable
+from torchfovea.tuning.bias import Shape, encode
+from torchfovea.tuning.cells import reachable
 from torchfovea.tuning.prior_field import fit_by_gradient, fit_closed_form
 from torchfovea.tuning.problem import Problem, evaluate_bias
 from torchfovea.tuning.rivals import fitted_bias, remembered_bias

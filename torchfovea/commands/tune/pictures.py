@@ -14,7 +14,8 @@ from torch import Tensor
 
 from torchfovea.commands.shared.pictures import PALETTE
 from torchfovea.files import write_figure
-from torchfovea.tuning.bias import log_density_each, log_normalizer_each, reachable
+from torchfovea.tuning.bias import log_density_each, log_normalizer_each
+from torchfovea.tuning.cells import reachable
 from torchfovea.tuning.problem import Problem
 from torchfovea.tuning.scenes import Scenes, draw_scenes, stream
 from torchfovea.tuning.study import Row, mean_curves, student
@@ -61,7 +62,7 @@ def _draw_bias(path: Path, problem: Problem, start: Tensor, state: State) -> Non
             bias = problem.bias(vector, scenes.take(torch.arange(1)))
             density = log_density_each(bias, direction[None])[0] - log_normalizer_each(bias, problem.quadrature)
         shown.append(torch.where(within, density.exp().reshape(within.shape), torch.nan).numpy())
-        ax.set(title=f"{title}, α = {float(bias.alpha):.2f}", xlabel="azimuth [°] (left is positive)")
+        ax.set(title=f"{title}, α = {float(bias.weights.alpha):.2f}", xlabel="azimuth [°] (left is positive)")
     most = max(float(np.nanmax(values)) for values in shown)
     for ax, values in zip(axes, shown, strict=True):
         drawn = ax.pcolormesh(azimuth, elevation, values, cmap="viridis", vmin=0, vmax=most, rasterized=True)
