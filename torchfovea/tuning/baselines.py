@@ -82,10 +82,10 @@ def _plain_hand(shape: Shape, distribution: Distribution, sigma: float, alpha: f
 def _conditioned_hand(shape: Shape, distribution: Distribution, sigma: float, alpha: float) -> Tensor:
     a0, a1, e0, e1 = distribution.regions[0]
     side = torch.linspace(-1, 1, 9, dtype=torch.float64)
-    task = torch.cartesian_prod(side, side)
+    task = torch.nn.functional.pad(torch.cartesian_prod(side, side), (0, shape.task_numbers - 2))
     centre = _centre((a0 + a1) / 2 + task[:, 0] * (a1 - a0) / 2, (e0 + e1) / 2 + task[:, 1] * (e1 - e0) / 2)
-    coefficients = torch.linalg.lstsq(features(task), centre).solution
-    body = torch.zeros(6, shape.numbers, dtype=torch.float64)
+    coefficients = torch.linalg.lstsq(features(task), centre, driver="gelsd").solution  # some features are 0
+    body = torch.zeros(shape.monomials, shape.numbers, dtype=torch.float64)
     m = shape.components
     body[:, : 3 * m] = coefficients.repeat(1, m)
     body[0, 3 * m : 6 * m] = math.log(sigma)
@@ -109,7 +109,7 @@ def _ranges(problem: Problem, start: Tensor) -> tuple[Tensor, Tensor]:
     low[3 * m : 6 * m], high[3 * m : 6 * m] = -2.5, 0.0
     low[9 * m :], high[9 * m :] = -2.0, 2.0
     if shape.conditioned:
-        narrow = torch.full((5 * shape.numbers,), 0.5)
+        narrow = torch.full(((shape.monomials - 1) * shape.numbers,), 0.5)
         low, high = torch.cat((low, -narrow)), torch.cat((high, narrow))
     if shape.tune_alpha:
         low, high = torch.cat((low, torch.tensor([-2.0]))), torch.cat((high, torch.tensor([1.0])))

@@ -32,14 +32,15 @@ class Shape:
 
     Attributes:
         components: M ≥ 1.
-        conditioned: whether the mixture depends on a task (B, 2) by quadratic regression: each of its numbers is a
-            polynomial of the task with six coefficients.
+        conditioned: whether the mixture depends on a task (B, K) by quadratic regression: each of its numbers is a
+            polynomial of the task, with six coefficients for K = 2 and 15 for K = 4.
         tune_alpha: whether log α is the last number of the vector; else α is `alpha`.
         alpha: of a vector without it.
         fov_deg: where the sensor's field of view starts if log tan(fov/2) is a number of the vector, the last; None:
             it is not tuned.
         weights: of the acquisition's other terms.
         tuned: which of these are numbers of the vector, after log α, starting at `weights`.
+        task_numbers: K, of the task.
     """
 
     components: int = 1
@@ -49,6 +50,7 @@ class Shape:
     fov_deg: float | None = None
     weights: Weights = field(default_factory=Weights)
     tuned: tuple[str, ...] = ()
+    task_numbers: int = 2
 
     def __post_init__(self) -> None:
         """Raise SettingError for values out of range."""
@@ -73,7 +75,13 @@ class Shape:
     @property
     def body(self) -> int:
         """Numbers of all mixtures; α's comes next."""
-        return self.numbers * (6 if self.conditioned else 1)
+        return self.numbers * self.monomials
+
+    @property
+    def monomials(self) -> int:
+        """Coefficients of each number: of a quadratic polynomial of the task, or one."""
+        k = self.task_numbers
+        return 1 + k + k * (k + 1) // 2 if self.conditioned else 1
 
     @property
     def size(self) -> int:
@@ -110,9 +118,9 @@ class Bias(NamedTuple):
 
 
 def features(task: Tensor) -> Tensor:
-    """Monomials of a task up to second order, (B, 2) to (B, 6)."""
-    a, e = task.unbind(-1)
-    return torch.stack((torch.ones_like(a), a, e, a * a, a * e, e * e), -1)
+    """Monomials of a task up to second order, (B, K) to (B, 1 + K + K(K + 1)/2): 1, a, e, a², a e, e² for K = 2."""
+    first, second = torch.triu_indices(task.shape[-1], task.shape[-1])
+    return torch.cat((torch.ones_like(task[:, :1]), task, task[:, first] * task[:, second]), -1)
 
 
 def decode(shape: Shape, vector: Tensor, task: Tensor) -> Bias:
@@ -121,13 +129,13 @@ def decode(shape: Shape, vector: Tensor, task: Tensor) -> Bias:
     Args:
         shape: how to read it.
         vector: (shape.size,).
-        task: (B, 2); only a conditioned shape looks at it.
+        task: (B, K); only a conditioned shape looks at it.
 
     Returns:
         Mixtures with clamped log diagonals (−3 to 1), one for each scene if conditioned, else one. Differentiable.
     """
     body = vector[: shape.body]
-    raw = features(task) @ body.reshape(6, -1) if shape.conditioned else body[None]
+    raw = features(task) @ body.reshape(shape.monomials, -1) if shape.conditioned else body[None]
     m = shape.components
     means = raw[:, : 3 * m].unflatten(1, (m, 3))
     diagonal = raw[:, 3 * m : 6 * m].unflatten(1, (m, 3)).clamp(*_LOG_DIAGONAL).exp()
@@ -190,7 +198,7 @@ def encode(shape: Shape, mixture: DirectionMixture, alpha: float) -> Tensor:
     means = mixture.means[which] + apart * (torch.arange(m) >= given)[:, None]
     body = numbers_of(DirectionMixture(mixture.logits[which], means, mixture.cholesky[which]))
     if shape.conditioned:
-        body = torch.cat((body, torch.zeros(5 * len(body), dtype=torch.float64)))
+        body = torch.cat((body, torch.zeros((shape.monomials - 1) * len(body), dtype=torch.float64)))
     return torch.cat([body, shape.tail(alpha, shape.fov_deg)])
 
 
@@ -224,14 +232,16 @@ def fix_vector(shape: Shape, vector: Tensor) -> Tensor:
         tail[-1] = shape.tail(1.0, fov_of(shape, vector))[-1]
     if shape.conditioned:
         return vector.clamp(-_MEAN, _MEAN)
-    bias = decode(shape, vector, vector.new_zeros(1, 2))
+    bias = decode(shape, vector, vector.new_zeros(1, shape.task_numbers))
     mixture = DirectionMixture(bias.logits[0], bias.means[0], bias.cholesky[0])
     return torch.cat((encode(shape, mixture, float(bias.weights.alpha)).to(vector)[: shape.body], tail))
 
 
 def mixture_of(shape: Shape, vector: Tensor, task: Tensor | None = None) -> DirectionMixture:
-    """The mixture of a vector, for one task (2,) if it is conditioned."""
-    bias = decode(shape, vector, torch.zeros(1, 2).to(vector) if task is None else task[None].to(vector))
+    """The mixture of a vector, for one task (K,) if it is conditioned."""
+    bias = decode(
+        shape, vector, torch.zeros(1, shape.task_numbers).to(vector) if task is None else task[None].to(vector)
+    )
     return fix_gauge(DirectionMixture(bias.logits[0], bias.means[0], bias.cholesky[0]))
 
 

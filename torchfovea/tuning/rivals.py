@@ -59,27 +59,34 @@ def fit_vector(shape: Shape, direction: Tensor, task: Tensor, alpha: float) -> T
 
     A component's mean and covariance are those of the unit vectors (M = 1), with a standard deviation of at least 0.05
     along each axis. A conditioned shape's means are quadratic in the task by least squares; the mixture is one of the
-    residuals, the same for all tasks.
+    residuals, the same for all tasks. Where a task tells how sure it is (K = 4), the residuals' log squares are
+    regressed on it as well (Harvey 1976), and a component's diagonals follow.
 
     Args:
         shape: how a vector is read.
         direction: unit (K, 3).
-        task: (K, 2); only a conditioned shape looks at it.
+        task: (K, 2) or (K, 4); only a conditioned shape looks at it.
         alpha: of the vector.
 
     Raises:
         SettingError: for a degenerate fit: fewer different directions than components and one more, or than the
-            regression's six coefficients.
+            regression's coefficients.
     """
     direction, task = direction.double(), task.double()
     if not shape.conditioned:
         return encode(shape, fit_mixture(direction, shape.components), alpha)
-    _require_different(direction, max(shape.components + 1, 7))
-    x, m = features(task), shape.components
-    require(int(torch.linalg.matrix_rank(x)) == 6, "tasks to fit", len(x), "tasks that tell a quadratic function apart")
+    x, m, needed = features(task), shape.components, shape.monomials
+    _require_different(direction, max(m + 1, needed + 1))
+    told = int(torch.linalg.matrix_rank(x)) == needed
+    require(told, "tasks to fit", len(x), "tasks that tell a quadratic function apart")
     coefficients = torch.linalg.lstsq(x, direction).solution
-    body = torch.zeros(6, shape.numbers, dtype=torch.float64)
-    body[0] = numbers_of(_mixture(direction - x @ coefficients, m))
+    apart = direction - x @ coefficients
+    body = torch.zeros(needed, shape.numbers, dtype=torch.float64)
+    body[0] = numbers_of(_mixture(apart, m))
+    if shape.task_numbers > 2:
+        line = x[:, : 1 + shape.task_numbers]
+        slope = torch.linalg.lstsq(line, 0.5 * (apart.square() + _LEAST_STD**2).log()).solution[1:]
+        body[1 : 1 + shape.task_numbers, 3 * m : 6 * m] += slope.repeat(1, m)
     body[:, : 3 * m] += coefficients.repeat(1, m)
     return torch.cat([body.flatten(), shape.tail(alpha, shape.fov_deg)])
 

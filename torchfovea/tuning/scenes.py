@@ -38,6 +38,8 @@ class Distribution:
         conditioned: whether each scene has a task: a centre drawn from the region, told to the policy as a vector in
             [-1, 1]², with the target within `task_spread_deg` of it.
         task_spread_deg: half widths in azimuth and elevation about the task's centre [deg].
+        told_spread: at most how many times wider or narrower than that the target may stand, drawn for each scene on a
+            logarithmic scale and told as two more numbers of the task; 1: always as wide, and not told.
         cans: how many in all, at least 2.
         target_range_m: to the target's centre.
         azimuth_deg: of the other cans' centres.
@@ -57,6 +59,7 @@ class Distribution:
     regions: tuple[tuple[float, float, float, float], ...] = ((15.0, 45.0, -23.0, -7.0),)
     conditioned: bool = False
     task_spread_deg: Range = (8.0, 5.0)
+    told_spread: float = 1.0
     cans: int = 7
     target_range_m: Range = (0.9, 1.3)
     azimuth_deg: Range = (-50.0, 50.0)
@@ -97,6 +100,7 @@ class Distribution:
             ordered = ordered and (name == "task_spread_deg" or pair[0] <= pair[1])
             require(ordered, f"distribution.{name}", pair, f"(low, high) within {low} to {high}")
             object.__setattr__(self, name, pair)
+        require(1 <= self.told_spread <= 10, "distribution.told_spread", self.told_spread, "a factor from 1 to 10")
         require(0 <= self.margin_m <= 5, "distribution.margin_m", self.margin_m, "0 to 5 metres")
         for name in ("front_m", "back_m", "side_m", "height_m"):
             require(
@@ -104,8 +108,13 @@ class Distribution:
             )
         require(1 <= self.tries <= 10**6, "distribution.tries", self.tries, "1 to 1000000")
 
+    @property
+    def task_numbers(self) -> int:
+        """How many numbers a task has: where, and if it is told how sure that is."""
+        return 4 if self.conditioned and self.told_spread > 1 else 2
+
     def region_of(self, a: float, e: float) -> tuple[float, float, float, float]:
-        """Where the target of a conditioned task (a, e) in [-1, 1]² may stand, as one of `regions`."""
+        """Where the target of a conditioned task (a, e) in [-1, 1]² may stand, one of `regions`, at middling spread."""
         left, right, low, high = self.regions[0]
         azimuth, elevation = (left + right + a * (right - left)) / 2, (low + high + e * (high - low)) / 2
         da, de = self.task_spread_deg
@@ -122,7 +131,7 @@ class Scenes(NamedTuple):
         high: of their upper ends, (B, S).
         radius: (B, S).
         nearest_m: range of the target's nearest point, (B,).
-        task: what the policy is told, (B, 2) in [-1, 1]; zeros where the distribution is not conditioned.
+        task: what the policy is told, (B, 2) or (B, 4) in [-1, 1]; zeros where the distribution is not conditioned.
         walls: the room as (front, back, side, floor, ceiling): x in [-back, front], |y| <= side, z in [floor, ceiling].
     """
 
@@ -199,11 +208,13 @@ def draw_scenes(
     region = torch.tensor(d.regions, dtype=torch.float64)
     mode = torch.randint(len(region), (n,), generator=generator)
     bounds = region[mode]
-    task = torch.zeros(n, 2, dtype=torch.float64)
+    task = torch.zeros(n, d.task_numbers, dtype=torch.float64)
     if d.conditioned:
-        task = uniform((n, 2), -1.0, 1.0)
-        centre = (bounds[:, ::2] + bounds[:, 1::2]) / 2 + task * (bounds[:, 1::2] - bounds[:, ::2]) / 2
+        task = uniform((n, d.task_numbers), -1.0, 1.0)
+        centre = (bounds[:, ::2] + bounds[:, 1::2]) / 2 + task[:, :2] * (bounds[:, 1::2] - bounds[:, ::2]) / 2
         spread = torch.tensor(d.task_spread_deg, dtype=torch.float64)
+        if d.task_numbers > 2:
+            spread = spread * d.told_spread ** task[:, 2:]
         bounds = torch.stack((centre - spread, centre + spread), -1).flatten(1)
     walls = (d.front_m, d.back_m, d.side_m, -head.ego_height_m, d.height_m - head.ego_height_m)
     can = torch.zeros(n, s, 5, dtype=torch.float64)

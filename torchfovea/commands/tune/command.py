@@ -71,7 +71,8 @@ def build_problem(cfg: DictConfig) -> Problem:
         require(isinstance(cfg[setting], bool), setting, cfg[setting], "true or false")
     fov_deg = float(cfg.sensor.fov_deg) if cfg.tune_fov else None
     components = whole(cfg, "components")
-    shape = Shape(components, distribution.conditioned, cfg.tune_alpha, alpha, fov_deg, weights, tuned)
+    task_numbers = distribution.task_numbers
+    shape = Shape(components, distribution.conditioned, cfg.tune_alpha, alpha, fov_deg, weights, tuned, task_numbers)
     return Problem(task, distribution, shape, whole(cfg, "memory.cells", 2))
 
 

@@ -28,7 +28,7 @@ def memory_yaml(problem: Problem, vector: Tensor, task: Tensor | None, note: str
 
 def write_memory(problem: Problem, vector: Tensor, folder: Path, name: str = "tuned", how: str = "Tuned on") -> None:
     """A vector as files for `search --config-dir FOLDER memory=NAME`; a conditioned one for nine tasks."""
-    weights = decode(problem.shape, vector, torch.zeros(1, 2, dtype=torch.float64)).weights
+    weights = decode(problem.shape, vector, torch.zeros(1, problem.shape.task_numbers, dtype=torch.float64)).weights
     told = {field.name: float(getattr(weights, field.name)) for field in fields(weights)}
     plain = not any(value for name, value in told.items() if name != "alpha")
     given = [f"acquisition.{name}={value:.4g}" for name, value in told.items() if name == "alpha" or value]
@@ -37,7 +37,8 @@ def write_memory(problem: Problem, vector: Tensor, folder: Path, name: str = "tu
     fov_deg = 2 * math.degrees(math.atan(observer.retina.radius_px / observer.camera.focal_px))
     tasks: dict[str, Tensor | None] = {"": None}
     if problem.shape.conditioned:
-        tasks = {f"_task_{a:+.0f}_{e:+.0f}": torch.tensor([a, e]) for a, e in _CORNERS}
+        unsure = [0.0] * (problem.shape.task_numbers - 2)  # middling
+        tasks = {f"_task_{a:+.0f}_{e:+.0f}": torch.tensor([a, e, *unsure]) for a, e in _CORNERS}
     for suffix, task in tasks.items():
         use = f"search --config-dir THIS_RUNS_FOLDER memory={name}{suffix} scene={own.name}{suffix}"
         note = f"{how} {own.name}: torchfovea {use} {acquisition} sensor.fov_deg={fov_deg:.4g}"
