@@ -1,15 +1,17 @@
-"""Where does a gradient gain on a fit? `python scripts/gradients.py [--ways bias weights both] [settings of tune]`.
+"""Where does a gradient gain on a fit? `python scripts/gradients.py [--ways=bias,weights,both] KEPT [settings]`.
 
 For each seed a bias is fitted to the targets of `start_episodes` training scenes, with the α that is best on
 validation scenes; from there gradients climb for `episodes`: `bias` (and α), `weights` (α and `tune_weights`, the bias
 as it is) or `both`. Each is judged beside a bias fitted in all the episodes together, on held-out scenes that are the
-seed's own, and the difference has Student's 95% interval over the seeds.
+seed's own, and the difference has Student's 95% interval over the seeds. What a seed came to is kept in the folder
+KEPT, one for each problem; with --only SEED a call makes that one alone. The settings are those of `torchfovea tune`.
 """
 
 from __future__ import annotations
 
 import argparse
 from dataclasses import fields, replace
+from pathlib import Path
 
 import torch
 from hydra import compose, initialize_config_dir
@@ -18,12 +20,15 @@ from omegaconf import DictConfig
 from torchfovea.commands.shared.config import conf_dir
 from torchfovea.commands.tune.command import build_problem
 from torchfovea.commands.tune.judge import build_start
+from torchfovea.files import write_tensors
+from torchfovea.setting import require
 from torchfovea.tuning.bias import decode
 from torchfovea.tuning.problem import Problem, evaluate_bias
 from torchfovea.tuning.rivals import best_alpha, fitted_bias, remembered_bias
 from torchfovea.tuning.scenes import stream
 from torchfovea.tuning.study import student
 from torchfovea.tuning.train import Schedule, train
+from torchfovea.untrusted import read_tensors
 
 WAYS = ("bias", "weights", "both")
 SIZES = {"episodes": 1024, "validation_scenes": 256, "heldout_scenes": 1024}  # what is null
@@ -69,13 +74,18 @@ def told(values: list[float]) -> str:
     return f"{mean:+.4f} ({low:+.4f} to {high:+.4f})"
 
 
-def compare(settings: list[str], ways: list[str], seeds: int) -> None:
+def compare(kept: Path, settings: list[str], ways: list[str], seeds: list[int]) -> None:
     """Print every bias's score, and its difference from the fitted one."""
     torch.set_num_threads(1)
     with initialize_config_dir(conf_dir(), version_base="1.3"):
         cfg = compose("tune", overrides=["warm_episodes=0", "start_episodes=256", *settings])
     problem = build_problem(cfg)
-    found = [one_seed(cfg, problem, seed, ways) for seed in range(seeds)]
+    found = []
+    for seed in seeds:
+        path = kept / f"{seed}.pt"
+        if not path.exists():
+            write_tensors(path, one_seed(cfg, problem, seed, ways))
+        found.append(read_tensors(path))
     print("bias, score, minus fitted")
     for name in found[0]:
         scores = [float(one[name].mean()) for one in found]
@@ -84,8 +94,12 @@ def compare(settings: list[str], ways: list[str], seeds: int) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--ways", nargs="+", choices=WAYS, default=["bias"])
-    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("kept", type=Path, help="folder of what the seeds came to")
+    parser.add_argument("--ways", default="bias", help="some of " + ",".join(WAYS))
+    parser.add_argument("--seeds", type=int, default=5, help="how many")
+    parser.add_argument("--only", type=int, help="this one alone")
     parser.add_argument("settings", nargs="*", help="of torchfovea tune")
     given = parser.parse_args()
-    compare(given.settings, given.ways, given.seeds)
+    ways = given.ways.split(",")
+    require(set(ways) <= set(WAYS), "ways", given.ways, "some of " + ",".join(WAYS))
+    compare(given.kept, given.settings, ways, list(range(given.seeds)) if given.only is None else [given.only])

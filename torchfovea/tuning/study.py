@@ -19,7 +19,17 @@ from torchfovea.tuning.rivals import RIVALS
 from torchfovea.tuning.scenes import stream
 from torchfovea.tuning.train import ESTIMATORS, Schedule, train
 
-__all__ = ["Heldout", "Row", "budgets_up_to", "check_methods", "curves", "episodes_to_reach", "mean_curves", "student"]
+__all__ = [
+    "Heldout",
+    "Row",
+    "budgets_up_to",
+    "check_methods",
+    "curves",
+    "episodes_to_reach",
+    "mean_curves",
+    "reads_scenes",
+    "student",
+]
 
 _FIRST = 64
 # two-sided 95% quantiles of Student's t by degrees of freedom, for intervals over few seeds
@@ -75,6 +85,16 @@ def check_methods(methods: Collection[str]) -> None:
             method,
             words,
         )
+
+
+def reads_scenes(method: str) -> bool:
+    """Whether a method reads the geometry of training scenes; else it sees its own episodes alone.
+
+    An estimator's warm start is `coverage`, which does, unless another is named.
+    """
+    name, _, warm = method.partition("+")
+    blind = ("counterfactual", "policy", "none")
+    return method == "fitted" or (name in ESTIMATORS and (name not in blind or warm not in blind))
 
 
 def curves(

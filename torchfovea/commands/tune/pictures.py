@@ -18,12 +18,13 @@ from torchfovea.tuning.bias import log_density_each, log_normalizer_each
 from torchfovea.tuning.cells import reachable
 from torchfovea.tuning.problem import Problem
 from torchfovea.tuning.scenes import Scenes, draw_scenes, stream
-from torchfovea.tuning.study import Row, mean_curves, student
+from torchfovea.tuning.study import Row, mean_curves, reads_scenes, student
 from torchfovea.tuning.train import State
 
 matplotlib.use("Agg")
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 __all__ = ["draw_curves", "draw_gradients", "draw_tuning"]
 
@@ -122,14 +123,27 @@ def draw_gradients(path: Path, checks: Sequence[dict[str, Any]]) -> None:
 
 
 def draw_curves(path: Path, rows: Sequence[Row]) -> None:
-    """Held-out score over episodes for each method: mean over seeds with its 95% interval (Student's t)."""
-    figure = Figure(figsize=(7.6, 5), layout="constrained")
+    """Held-out score over episodes for each method: mean over seeds with its 95% interval (Student's t).
+
+    Full lines read the training scenes, broken ones see nothing but their own episodes; each kind has a legend.
+    """
+    figure = Figure(figsize=(8.6, 4.6), layout="constrained")
     ax = figure.subplots()
+    kinds: dict[bool, list[Line2D]] = {True: [], False: []}
     for k, (method, by_budget) in enumerate(mean_curves(rows).items()):
         mean, low, high = np.array([student(values) for values in by_budget.values()]).T
-        budgets, colour, dots = list(by_budget), PALETTE[k % len(PALETTE)], "o-" if k < len(PALETTE) else "s--"
-        ax.plot(budgets, mean, dots, ms=3.5, color=colour, label=method.replace("_", " "))
-        ax.fill_between(budgets, low, high, color=colour, alpha=0.15, lw=0)
-    ax.set(xscale="log", xlabel="simulated episodes, counterfactual runs included", ylabel="held-out gap per saccade")
-    ax.legend(frameon=False, ncols=2)
+        budgets, colour, reads = list(by_budget), PALETTE[k % len(PALETTE)], reads_scenes(method)
+        style, label = "o-" if reads else "s--", method.replace("_", " ").replace("+none", "")
+        kinds[reads] += ax.plot(budgets, mean, style, ms=3.5, color=colour, label=label)
+        ax.fill_between(budgets, low, high, color=colour, alpha=0.12, lw=0)
+    ax.set(xscale="log", xlabel="simulated episodes, counterfactual runs and scenes that are read included",
+           ylabel="held-out gap per saccade")  # fmt: skip
+    budgets = sorted({row.episodes for row in rows})
+    ax.set_xticks(budgets, [f"{budget:,}" for budget in budgets])
+    ax.minorticks_off()
+    if kinds[True]:
+        figure.legend(handles=kinds[True], title="reads the scenes", loc="outside right upper", frameon=False)
+    if kinds[False]:
+        title = "sees its own\nepisodes alone"
+        figure.legend(handles=kinds[False], title=title, loc="outside right lower", frameon=False)
     write_figure(path, figure, dpi=130)
