@@ -86,6 +86,7 @@ FLOORS = (
         "acquisition",
         "policies",
         "infomax",
+        "weighted",
         "strategies",
         "reward",
         "worth",

@@ -92,6 +92,7 @@ TWICE = {
     "hedge": FROM_SETTINGS,
     "oracle": FROM_SETTINGS,
     "raster": FROM_SETTINGS,
+    "weighted": FROM_SETTINGS,
     "nearest_to": {"deciding.reward", "commands.shared.rewards"},  # as above, for rewards
     "decide": {"perception", PEER},
     "unscented": {"studies.propagation", PEER},

@@ -32,6 +32,7 @@ ALPHAS = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 2.5)
 
 _FARTHEST = 0.2  # share of the remembered fixations that is dropped
 _LEAST_STD = 0.05  # of a fitted component, about the shape's own limit
+_NO_LOG_OF_0 = 0.01  # of a unit vector's component
 _FIRST = 32
 _ROUNDS = 200
 _TRIED = (0.1, 0.3, 1.0)  # α, on training episodes
@@ -85,8 +86,10 @@ def fit_vector(shape: Shape, direction: Tensor, task: Tensor, alpha: float) -> T
     body[0] = numbers_of(_mixture(apart, m))
     if shape.task_numbers > 2:
         line = x[:, : 1 + shape.task_numbers]
-        slope = torch.linalg.lstsq(line, 0.5 * (apart.square() + _LEAST_STD**2).log()).solution[1:]
+        slope = torch.linalg.lstsq(line, 0.5 * (apart.square() + _NO_LOG_OF_0**2).log()).solution[1:]
         body[1 : 1 + shape.task_numbers, 3 * m : 6 * m] += slope.repeat(1, m)
+        # the mean of the variances stays
+        body[0, 3 * m : 6 * m] -= 0.5 * (2 * task @ slope).exp().mean(0).log().repeat(m)
     body[:, : 3 * m] += coefficients.repeat(1, m)
     return torch.cat([body.flatten(), shape.tail(alpha, shape.fov_deg)])
 
