@@ -58,7 +58,7 @@ def one_seed(cfg: DictConfig, problem: Problem, seed: int, ways: list[str]) -> d
     found["remembered"] = problem, remembered_bias(problem, begin, whole, seed, checked)
     found |= {way: climb(problem, start, way, schedule) for way in ways}
     for name, (own, vector) in found.items():
-        weights = decode(own.shape, vector, torch.zeros(1, own.shape.task_numbers)).weights
+        weights = decode(own.shape, vector, torch.zeros(1, own.shape.task_numbers).to(vector)).weights
         what = " ".join(f"{key} {float(getattr(weights, key)):.3g}" for key in ("alpha", *own.shape.tuned))
         print(f"  seed {seed}  {name}: {what}", flush=True)
     judge = int(cfg.heldout_seed) + seed
