@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from torchfovea.cli import main
 from torchfovea.commands.shared.build import build_cells
-from torchfovea.deciding.weighted import Weights
+from torchfovea.deciding.weighted import Weighting
 from torchfovea.memory.egosphere import Prior
 from torchfovea.memory.sphere import direction_mixture, log_density, log_normalizer, sphere_quadrature
 from torchfovea.perception import Observer
@@ -61,7 +61,7 @@ def test_densities_are_those_of_the_sphere():
     mixture = direction_mixture(
         [0.3, 0.7], [MEAN, [0.2, -0.5, 0.1]], [[0.1, 0.2, 0.05], [0.3, 0.1, 0.2]], dtype=torch.float64
     )
-    bias = Bias(*(part[None] for part in mixture), Weights())
+    bias = Bias(*(part[None] for part in mixture), Weighting())
     direction = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=-1)
     torch.testing.assert_close(log_density_each(bias, direction[None])[0], log_density(mixture, direction))
     quadrature = sphere_quadrature(3000, lambda d: reachable(HEAD, d), torch.float64)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchfovea.deciding.weighted import Weights
+from torchfovea.deciding.weighted import Weighting
 from torchfovea.perception import Observer
 from torchfovea.sensing.camera import Fisheye, Pinhole
 from torchfovea.sensing.geometric import correspond_points
@@ -163,7 +163,7 @@ def small(dtype=torch.float64, scenes=3, cells=25, saccades=5, **settings):
 
 def test_an_episode_is_that_of_a_loop():
     task, scenes, world = small()
-    run = simulate(task, scenes, world, Weights(torch.tensor(0.7, dtype=torch.float64)))
+    run = simulate(task, scenes, world, Weighting(torch.tensor(0.7, dtype=torch.float64)))
     for b in range(3):
         value, rewards, chosen = episode_by_loop(task, scenes, b, world, 0.7)
         assert run.cell[b, 1:].tolist() == chosen
@@ -173,7 +173,7 @@ def test_an_episode_is_that_of_a_loop():
 
 def test_a_batch_is_its_episodes(dtype):
     task, scenes, world = small(dtype, scenes=5)
-    weights = Weights(torch.tensor(0.3, dtype=dtype))
+    weights = Weighting(torch.tensor(0.3, dtype=dtype))
     together = simulate(task, scenes, world, weights)
     for b in range(5):
         one = torch.tensor([b])
@@ -184,7 +184,7 @@ def test_a_batch_is_its_episodes(dtype):
 
 def test_a_later_start_goes_on_as_the_whole_run():
     task, scenes, world = small(scenes=6, saccades=7)
-    weights = Weights(torch.tensor(0.5, dtype=torch.float64))
+    weights = Weighting(torch.tensor(0.5, dtype=torch.float64))
     whole = simulate(task, scenes, world, weights, keep=True)
     made = torch.tensor([0, 4, 2, 5, 1, 2])
     row = torch.arange(6)
@@ -197,7 +197,7 @@ def test_a_later_start_goes_on_as_the_whole_run():
 def test_the_reward_in_range_is_a_setting():
     task, _, world = small(reward="range")
     memory = look(task, world, empty(world), eyes(HEAD, Gaze(*(torch.zeros(3).double(),) * 3)), 0)
-    value = score(task, world, memory, Weights(0.0))[0]
+    value = score(task, world, memory, Weighting(0.0))[0]
     eligible = torch.isfinite(value)
     torch.testing.assert_close(value[eligible], -(memory.precision / memory.vector)[eligible])
 
@@ -205,7 +205,7 @@ def test_the_reward_in_range_is_a_setting():
 def test_nothing_eligible_looks_ahead():
     task, scenes, world = small()
     world = world._replace(allowed=torch.zeros_like(world.allowed))
-    run = simulate(task, scenes, world, Weights(1.0))
+    run = simulate(task, scenes, world, Weighting(1.0))
     assert (run.cell == -1).all() and torch.isfinite(run.value).all()
     assert best_cell(torch.tensor([[1.0, 3.0, 3.0], [-math.inf] * 3]))[1].tolist() == [1, -1]
 

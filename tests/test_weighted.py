@@ -16,7 +16,7 @@ from torchfovea.commands.shared.config import conf_dir
 from torchfovea.commands.shared.strategy import build_strategy
 from torchfovea.commands.tune.command import build_problem
 from torchfovea.deciding import acquisition, strategies
-from torchfovea.deciding.weighted import Terms, Weights, joined, saccades_left, weighted_score
+from torchfovea.deciding.weighted import Terms, Weighting, joined, saccades_left, weighted_score
 from torchfovea.memory.sphere import fibonacci_directions
 from torchfovea.perception import Observer, decide, new_memory
 from torchfovea.sensing.camera import Pinhole
@@ -33,7 +33,7 @@ from torchfovea.tuning.study import reads_scenes
 from torchfovea.tuning.train import ESTIMATORS, Schedule, train
 from torchfovea.tuning.worlds import Known, Task
 
-ALL = Weights(0.7, 0.8, -0.6, 0.4, 0.3, 0.2, 0.01)
+ALL = Weighting(0.7, 0.8, -0.6, 0.4, 0.3, 0.2, 0.01)
 TUNED = ("by_time", "by_unseen", "improvement", "information", "cost_per_deg")
 
 
@@ -61,7 +61,7 @@ def test_it_is_differentiable_in_weights_and_terms():
     terms = terms_of(2, 3)
 
     def score(*given):
-        rows = Weights(*(weight.expand(2) for weight in given[:7]))
+        rows = Weighting(*(weight.expand(2) for weight in given[:7]))
         return weighted_score(rows, Terms(*given[7:]))
 
     weights = [torch.tensor(v, dtype=torch.float64) for v in ALL.numbers.values()]
@@ -72,12 +72,12 @@ def test_it_is_differentiable_in_weights_and_terms():
 def test_alpha_alone_is_the_upper_confidence_bound(alpha):
     terms = terms_of()._replace(unseen=None, degrees=None, information=None, doubt=None)
     bound = acquisition.upper_confidence_bound(terms.mean, terms.std, alpha)
-    assert torch.equal(weighted_score(Weights(alpha), terms), bound)
+    assert torch.equal(weighted_score(Weighting(alpha), terms), bound)
 
 
 def test_rows_of_weights_are_the_weights_of_rows():
     terms, parts = terms_of(2), (ALL, replace(ALL, alpha=0.1, improvement=-1.0))
-    rows = [Weights(*(torch.tensor([v], dtype=torch.float64) for v in part.numbers.values())) for part in parts]
+    rows = [Weighting(*(torch.tensor([v], dtype=torch.float64) for v in part.numbers.values())) for part in parts]
     together = weighted_score(joined(rows), terms)
     for b, part in enumerate(parts):
         one = Terms(*(t[b] if isinstance(t, torch.Tensor) else t for t in terms))
@@ -87,15 +87,15 @@ def test_rows_of_weights_are_the_weights_of_rows():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Weights(-1.0), r"acquisition\.alpha = -1"),
-        (lambda: Weights(improvement=math.inf), r"acquisition\.improvement = inf"),
-        (lambda: Weights(by_time="much"), r"acquisition\.by_time = much"),
-        (lambda: weighted_score(Weights(cost_per_deg=1.0), terms_of()._replace(degrees=None)), "cost_per_deg = 1"),
-        (lambda: weighted_score(Weights(by_unseen=1.0), terms_of()._replace(unseen=None)), "unseen = None"),
+        (lambda: Weighting(-1.0), r"acquisition\.alpha = -1"),
+        (lambda: Weighting(improvement=math.inf), r"acquisition\.improvement = inf"),
+        (lambda: Weighting(by_time="much"), r"acquisition\.by_time = much"),
+        (lambda: weighted_score(Weighting(cost_per_deg=1.0), terms_of()._replace(degrees=None)), "cost_per_deg = 1"),
+        (lambda: weighted_score(Weighting(by_unseen=1.0), terms_of()._replace(unseen=None)), "unseen = None"),
         (lambda: Shape(tuned=("alpha",)), "tune_weights = alpha: expected each once, any of by_time"),
         (lambda: Shape(tuned=("by_time", "by_time")), "tune_weights = by_time"),
-        (lambda: Shape(weights=Weights(cost_per_deg=0.5), tuned=("cost_per_deg",)), r"cost_per_deg = 0\.5"),
-        (lambda: Shape(weights=Weights(doubt=1.0)), r"acquisition\.doubt = 1"),
+        (lambda: Shape(weights=Weighting(cost_per_deg=0.5), tuned=("cost_per_deg",)), r"cost_per_deg = 0\.5"),
+        (lambda: Shape(weights=Weighting(doubt=1.0)), r"acquisition\.doubt = 1"),
         (lambda: Distribution(told_spread=0.5), r"distribution\.told_spread = 0\.5"),
     ],
 )
@@ -112,7 +112,7 @@ def test_a_search_counts_its_saccades_and_what_it_has_not_seen():
 
     def seen(view):
         views.append(view)
-        return strategies.weighted(view, Weights(1.0, by_time=2.0, by_unseen=1.0, cost_per_deg=0.01), 5)
+        return strategies.weighted(view, Weighting(1.0, by_time=2.0, by_unseen=1.0, cost_per_deg=0.01), 5)
 
     first = decide(observer, memory, strategy=seen)
     assert (first.state.made, decide(observer, memory, before=first, strategy=seen).state.made) == (1, 2)
@@ -148,13 +148,13 @@ def problem(saccades=6, cells=25, cost=0.0, distribution=None, weights=None, **s
     task = Task(Observer(camera=Pinhole.from_fov(70.0, 100.0)), saccades, saccade_cost=cost)
     own = distribution or Distribution(cans=3)
     given = Shape(
-        1, own.conditioned, weights=weights or Weights(), task_numbers=own.task_numbers, **{"tuned": TUNED, **shape}
+        1, own.conditioned, weights=weights or Weighting(), task_numbers=own.task_numbers, **{"tuned": TUNED, **shape}
     )
     return Problem(task, own, given, cells, torch.float64)
 
 
 def test_a_vector_holds_the_weights():
-    p = problem(weights=Weights(cost_per_deg=0.004, by_time=0.5))
+    p = problem(weights=Weighting(cost_per_deg=0.004, by_time=0.5))
     x = table_1(p.shape, "target", 0.6)
     assert p.shape.size == 9 + 1 + 5 == len(x)
     found = decode(p.shape, x, torch.zeros(1, 2)).weights

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchfovea.deciding import acquisition, infomax, policies
 from torchfovea.deciding.acquisition import Generators
 from torchfovea.deciding.reward import RewardBelief, inverse_range_from_range
-from torchfovea.deciding.weighted import Terms, Weights, saccades_left, weighted_score
+from torchfovea.deciding.weighted import Terms, Weighting, saccades_left, weighted_score
 from torchfovea.memory.classes import class_moments
 from torchfovea.memory.egosphere import Memory
 from torchfovea.sensing.camera import Camera
@@ -227,7 +227,7 @@ class _Course(NamedTuple):
 
 
 def weighted(
-    view: View, weights: Weights, saccades: int, foresight: Strategy | None = None, sought: int | None = None
+    view: View, weights: Weighting, saccades: int, foresight: Strategy | None = None, sought: int | None = None
 ) -> tuple[Tensor, _Course]:
     """The family of `torchfovea.deciding.weighted`: a weighted sum of mean, spread, improvement, information and cost.
 

@@ -25,14 +25,14 @@ from torch import Tensor
 from torchfovea.deciding.acquisition import expected_improvement, upper_confidence_bound
 from torchfovea.setting import require
 
-__all__ = ["Terms", "Weights", "joined", "saccades_left", "weighted_alpha", "weighted_score"]
+__all__ = ["Terms", "Weighting", "joined", "saccades_left", "weighted_alpha", "weighted_score"]
 
 _MOST = 20.0  # of the exponent
 
 
 @dataclass(frozen=True)
-class Weights:
-    """Weights of the terms; each a number, or one for each row (...).
+class Weighting:
+    """Weighting of the terms; each a number, or one for each row (...).
 
     Attributes:
         alpha: of the standard deviation, at the middle of the search with half of the cells seen; ≥ 0, inf allowed.
@@ -71,14 +71,14 @@ class Weights:
         """Whether a term has to be worked out: its weight is not 0 for all."""
         return isinstance(getattr(self, name), Tensor) or getattr(self, name) != 0
 
-    def each(self, change: Callable[[Tensor], Tensor]) -> Weights:
+    def each(self, change: Callable[[Tensor], Tensor]) -> Weighting:
         """The same with every tensor changed, such as to the rows of an index."""
         named = {field.name: getattr(self, field.name) for field in fields(self)}
         return replace(self, **{name: change(value) for name, value in named.items() if isinstance(value, Tensor)})
 
 
-def joined(parts: Sequence[Weights]) -> Weights:
-    """Weights of several batches, alike in what is one number for all, as those of one batch."""
+def joined(parts: Sequence[Weighting]) -> Weighting:
+    """Weighting of several batches, alike in what is one number for all, as those of one batch."""
     first = parts[0]
     rows = [name for name in (field.name for field in fields(first)) if name not in first.numbers]
     return replace(first, **{name: torch.cat([getattr(part, name) for part in parts]) for name in rows})
@@ -118,7 +118,7 @@ def saccades_left(made: int, saccades: int) -> float:
     return min(max(1 - made / max(saccades - 2, 1), 0.0), 1.0)
 
 
-def weighted_alpha(weights: Weights, left: float | Tensor, unseen: Tensor | None) -> float | Tensor:
+def weighted_alpha(weights: Weighting, left: float | Tensor, unseen: Tensor | None) -> float | Tensor:
     """α of a moment, see above; a number, or (...). Differentiable in what is a tensor."""
     exponent: float | Tensor = 0.0
     if weights.counts("by_time"):
@@ -132,7 +132,7 @@ def weighted_alpha(weights: Weights, left: float | Tensor, unseen: Tensor | None
     return weights.alpha * exponent.clamp(-_MOST, _MOST).exp()
 
 
-def weighted_score(weights: Weights, terms: Terms) -> Tensor:
+def weighted_score(weights: Weighting, terms: Terms) -> Tensor:
     """The score of every cell.
 
     Args:

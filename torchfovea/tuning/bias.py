@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchfovea.deciding.weighted import Weights
+from torchfovea.deciding.weighted import Weighting
 from torchfovea.memory.sphere import DirectionMixture, Quadrature, deep_tail, fix_gauge, log_radial_moment
 from torchfovea.setting import require
 
@@ -48,7 +48,7 @@ class Shape:
     tune_alpha: bool = True
     alpha: float = 1.0
     fov_deg: float | None = None
-    weights: Weights = field(default_factory=Weights)
+    weights: Weighting = field(default_factory=Weighting)
     tuned: tuple[str, ...] = ()
     task_numbers: int = 2
 
@@ -114,7 +114,7 @@ class Bias(NamedTuple):
     logits: Tensor
     means: Tensor
     cholesky: Tensor
-    weights: Weights
+    weights: Weighting
 
 
 def features(task: Tensor) -> Tensor:
@@ -154,7 +154,7 @@ def decode(shape: Shape, vector: Tensor, task: Tensor) -> Bias:
     return Bias(logits, means, cholesky, replace(shape.weights, alpha=log_alpha.exp(), **tuned))
 
 
-def nudged(shape: Shape, weights: Weights, offset: Tensor) -> Weights:
+def nudged(shape: Shape, weights: Weighting, offset: Tensor) -> Weighting:
     """A policy's weights for K rows, each with its log α and tuned weights moved by an offset (K, P) in the vector."""
     columns = list(offset.unbind(-1))
     k, moved = len(offset), {}

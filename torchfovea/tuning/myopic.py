@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchfovea.deciding.weighted import Weights
+from torchfovea.deciding.weighted import Weighting
 from torchfovea.metrics import gap
 from torchfovea.sensing.head import Gaze, eyes, fixate
 from torchfovea.setting import require
@@ -46,7 +46,7 @@ def myopic(problem: Problem, vector: Tensor, batch: Batch, alpha_share: float = 
     base_world = prepare(problem, bias, batch)
     slot = torch.randint(problem.cells, (n,), generator=rng)
     base_world.allowed[torch.arange(n), slot] = False
-    alone = Weights(bias.weights.alpha)  # a candidate is weighed by α, whatever else counts
+    alone = Weighting(bias.weights.alpha)  # a candidate is weighed by α, whatever else counts
     base = simulate(task, batch.scenes, base_world, bias.weights)
 
     # half of the candidates from the bias, half uniform: the importance weight is at most twice N/Q

@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchfovea.deciding.weighted import Weights
+from torchfovea.deciding.weighted import Weighting
 from torchfovea.sensing.head import eyes, fixate
 from torchfovea.tuning.cells import draw_cells, reachable
 from torchfovea.tuning.estimators import Gradient, policy_difference
@@ -83,7 +83,7 @@ def pathwise(problem: Problem, vector: Tensor, batch: Batch, alpha_share: float 
     prior = world_of(task, batch.scenes, hard, batch.noise)
     world = Worlds(cells, 1 / rho, batch.noise, inside, prior.prior_mean, prior.prior_precision)
     reward = -(1 - floor) / rho - floor * task.far_m
-    value = _soft_episode(problem, batch, world, reward, Weights(torch.as_tensor(bias.weights.alpha).detach()))
+    value = _soft_episode(problem, batch, world, reward, Weighting(torch.as_tensor(bias.weights.alpha).detach()))
     slope = torch.autograd.grad(value.mean(), x)[0].double()
     slope = torch.where(torch.isfinite(slope), slope, torch.zeros_like(slope))
     plain = prepare(problem, problem.bias(vector.detach(), batch.scenes), batch)
@@ -91,7 +91,7 @@ def pathwise(problem: Problem, vector: Tensor, batch: Batch, alpha_share: float 
     return Gradient(slope, float(value.detach().mean()), n + spent, n + round(spent))
 
 
-def _soft_episode(problem: Problem, batch: Batch, world: Worlds, reward: Tensor, weights: Weights) -> Tensor:
+def _soft_episode(problem: Problem, batch: Batch, world: Worlds, reward: Tensor, weights: Weighting) -> Tensor:
     """Value of an episode whose fixations are expectations, (B,)."""
     task = problem.task
     gaze, best = blank(task, batch.scenes)

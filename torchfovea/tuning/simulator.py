@@ -11,7 +11,7 @@ from torch import Tensor
 from torchfovea.deciding.infomax import information_gain, precision_by_eccentricity, saccade_degrees
 from torchfovea.deciding.reward import RewardBelief, range_from_inverse_range
 from torchfovea.deciding.strategies import inverse_range_acuity
-from torchfovea.deciding.weighted import Terms, Weights, saccades_left, weighted_score
+from torchfovea.deciding.weighted import Terms, Weighting, saccades_left, weighted_score
 from torchfovea.metrics import gap
 from torchfovea.sensing.camera import Pinhole
 from torchfovea.sensing.head import Gaze, cyclopean, eyes, fixate
@@ -76,7 +76,7 @@ class Run(NamedTuple):
 
 
 def score(
-    task: Task, world: Worlds, memory: Known, weights: Weights, moment: Moment | None = None
+    task: Task, world: Worlds, memory: Known, weights: Weighting, moment: Moment | None = None
 ) -> tuple[Tensor, Tensor]:
     """Score of every cell.
 
@@ -153,7 +153,7 @@ def blank(task: Task, scenes: Scenes) -> tuple[Gaze, Tensor]:
     return gaze, true_reward(task, scenes, Gaze(*(a[:, None] for a in gaze)))[:, 0]
 
 
-def _rows(weights: Weights, part: slice | Tensor) -> Weights:
+def _rows(weights: Weighting, part: slice | Tensor) -> Weighting:
     return weights.each(lambda weight: weight[part])
 
 
@@ -181,7 +181,7 @@ def foreseen(task: Task, world: Worlds) -> Tensor:
 
 
 def simulate(
-    task: Task, scenes: Scenes, world: Worlds, weights: Weights, start: Resumed | None = None, keep: bool = False
+    task: Task, scenes: Scenes, world: Worlds, weights: Weighting, start: Resumed | None = None, keep: bool = False
 ) -> Run:
     """Run B episodes with the hard policy.
 

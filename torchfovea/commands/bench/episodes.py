@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from torchfovea.commands.bench.timing import Path, Peer, same
 from torchfovea.commands.shared.build import build_arena, build_cells, build_scene_of, number, whole
 from torchfovea.commands.shared.rollout import roll_out
-from torchfovea.deciding.weighted import Weights
+from torchfovea.deciding.weighted import Weighting
 from torchfovea.perception import Observer, Step, decide, new_memory, perceive
 from torchfovea.sensing.camera import image_camera
 from torchfovea.sensing.head import Gaze, eyes
@@ -117,7 +117,7 @@ def tuning_episode(cfg: DictConfig, observer: Observer) -> Path:
     directions = build_cells(few, observer.head, generator).reshape(episodes, cells, 3)
     noise = torch.randn(task.saccades, episodes, cells, generator=generator)
     world = world_of(task, scenes, directions, noise)
-    weights = Weights(torch.ones(()))
+    weights = Weighting(torch.ones(()))
     part = [torch.tensor([b]) for b in range(min(8, episodes))]
     singles: list[tuple[Any, Worlds]] = [(scenes.take(one), world.take(one)) for one in part]
 

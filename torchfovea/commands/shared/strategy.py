@@ -14,7 +14,7 @@ from torch import Tensor
 from torchfovea.commands.shared.named import build_named, name_of
 from torchfovea.deciding import strategies
 from torchfovea.deciding.strategies import Strategy, View
-from torchfovea.deciding.weighted import Weights
+from torchfovea.deciding.weighted import Weighting
 from torchfovea.perception import Observer
 from torchfovea.search import StopRule
 from torchfovea.setting import require
@@ -166,7 +166,7 @@ def infomax(observer: Observer, overhead: float | None = None, unit: str = "degr
 
 def weighted(observer: Observer, saccades: int, **weights: float) -> Strategy:
     """The family of acquisitions with weights, over a search of so many saccades."""
-    given = Weights(**weights)
+    given = Weighting(**weights)
     classes = observer.classes
     require(not given.counts("doubt") or classes is not None, "acquisition.doubt", given.doubt, "0 without classes")
     return partial(

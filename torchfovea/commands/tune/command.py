@@ -22,7 +22,7 @@ from torchfovea.commands.shared.unread import refuse_unread
 from torchfovea.commands.tune.files import write_memory, write_scenes
 from torchfovea.commands.tune.judge import build_start, judge_policies, move_start
 from torchfovea.commands.tune.study import check_study, study_curves, study_gradients
-from torchfovea.deciding.weighted import Weights
+from torchfovea.deciding.weighted import Weighting
 from torchfovea.files import write_csv
 from torchfovea.setting import require
 from torchfovea.tuning.bias import Shape, fov_of
@@ -76,15 +76,15 @@ def build_problem(cfg: DictConfig) -> Problem:
     return Problem(task, distribution, shape, whole(cfg, "memory.cells", 2))
 
 
-def _weights(cfg: DictConfig) -> tuple[Weights, tuple[str, ...]]:
+def _weights(cfg: DictConfig) -> tuple[Weighting, tuple[str, ...]]:
     """The acquisition's weights besides α, and which of them are tuned."""
     require(OmegaConf.is_list(cfg.tune_weights), "tune_weights", cfg.tune_weights, "a list, [...]")
     tuned = tuple(str(name) for name in cfg.tune_weights)
     if cfg.acquisition.name == "ucb":
         require(not tuned, "tune_weights", list(tuned), "[] without acquisition=weighted")
-        return Weights(), ()
-    names = [field.name for field in fields(Weights)]
-    return replace(Weights(**{name: cfg.acquisition[name] for name in names}), alpha=1.0), tuned
+        return Weighting(), ()
+    names = [field.name for field in fields(Weighting)]
+    return replace(Weighting(**{name: cfg.acquisition[name] for name in names}), alpha=1.0), tuned
 
 
 def run(cfg: DictConfig) -> float:
