@@ -19,13 +19,13 @@ from torchfovea.setting import require
 from torchfovea.tuning.scenes import Scenes, first_surfaces
 from torchfovea.tuning.worlds import Known, Task, Worlds, empty, look
 
-__all__ = ["Moment", "Resumed", "Run", "best_cell", "blank", "score", "simulate", "true_reward", "worth"]
+__all__ = ["Outlook", "Resumed", "Run", "best_cell", "blank", "score", "simulate", "true_reward", "worth"]
 
 _FAR_M = 1000.0
 _ANGLES = 512  # of the table of what a fixation brings
 
 
-class Moment(NamedTuple):
+class Outlook(NamedTuple):
     """What a decision weighs besides the memory, as far as it has a weight.
 
     Attributes:
@@ -76,7 +76,7 @@ class Run(NamedTuple):
 
 
 def score(
-    task: Task, world: Worlds, memory: Known, weights: Weighting, moment: Moment | None = None
+    task: Task, world: Worlds, memory: Known, weights: Weighting, outlook: Outlook | None = None
 ) -> tuple[Tensor, Tensor]:
     """Score of every cell.
 
@@ -85,12 +85,12 @@ def score(
         world: the cells.
         memory: their beliefs.
         weights: of the acquisition, numbers or (B,).
-        moment: what it weighs besides; None: half-way, without what has to be known for cost and information.
+        outlook: what it weighs besides; None: half-way, without what has to be known for cost and information.
 
     Returns:
         Scores (B, N), −inf where not eligible, and the believed points (B, N, 3).
     """
-    observer, moment = task.observer, moment or Moment()
+    observer, outlook = task.observer, outlook or Outlook()
     mean, std = memory.vector / memory.precision, memory.precision.rsqrt()
     reward = RewardBelief(mean, std)
     if observer.reward == "range":
@@ -105,7 +105,7 @@ def score(
     ground = memory.seen & (height < limits.ground_z_m)
     eligible = world.allowed & reachable & (range_m > limits.nearest_m) & ~ground
     lowest = torch.full_like(mean, -math.inf)
-    terms = Terms(reward.mean, reward.std, reward.mean[..., 0], moment.left)
+    terms = Terms(reward.mean, reward.std, reward.mean[..., 0], outlook.left)
     if weights.counts("improvement"):
         best = torch.where(eligible & memory.seen, reward.mean, lowest).amax(-1)
         best = torch.where(torch.isfinite(best), best, torch.where(eligible, reward.mean, lowest).amax(-1))
@@ -113,10 +113,10 @@ def score(
     if weights.counts("by_unseen"):
         share = (eligible & ~memory.seen).sum(-1).to(mean) / eligible.sum(-1).clamp(min=1)
         terms = terms._replace(unseen=share)
-    if weights.counts("cost_per_deg") and moment.axis is not None:
-        terms = terms._replace(degrees=saccade_degrees(moment.axis, world.direction))
-    if weights.counts("information") and moment.precision is not None:
-        gain = information_gain(1 / memory.precision, moment.precision, eligible) / mean.shape[-1]
+    if weights.counts("cost_per_deg") and outlook.axis is not None:
+        terms = terms._replace(degrees=saccade_degrees(outlook.axis, world.direction))
+    if weights.counts("information") and outlook.precision is not None:
+        gain = information_gain(1 / memory.precision, outlook.precision, eligible) / mean.shape[-1]
         terms = terms._replace(information=gain)
     value = weighted_score(weights, terms)
     return torch.where(eligible, value, lowest), point
@@ -225,8 +225,8 @@ def simulate(
         axis = None
         if weights.counts("cost_per_deg"):
             axis = cyclopean(task.observer.head, Gaze(*angles[:, part, t]))[0][..., 2]
-        moment = Moment(saccades_left(t, steps), axis, None if precision is None else precision[part])
-        value, point = score(task, w, m, _rows(weights, part), moment)
+        outlook = Outlook(saccades_left(t, steps), axis, None if precision is None else precision[part])
+        value, point = score(task, w, m, _rows(weights, part), outlook)
         best, cell = best_cell(value)
         chosen = point.gather(1, cell.clamp(min=0)[:, None, None].expand(-1, 1, 3))[:, 0]
         now = Gaze(*(angle * (cell >= 0) for angle in fixate(task.observer.head, chosen)[0]))
