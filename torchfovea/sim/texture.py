@@ -72,12 +72,10 @@ def _turns() -> np.ndarray:
     return np.linalg.qr(np.random.default_rng(7).standard_normal((3, 3, 3)))[0]
 
 
-def _noise(point: Components, scale: int) -> tuple[Tensor, ...]:
-    """Noise at points (R, C) [m]: three octaves from fine to coarse, and that of the colour."""
-    x, y, z = point
-    turn = (_turns()[scale] / (_VOXELS_M[scale] * _SIZE)).T.tolist()
-    u, v, w = ((x * a).add_(y, alpha=b).add_(z, alpha=c) for a, b, c in turn)
-    return _volume(x.device).at(u, v, w)
+def _noise(point: Tensor, scale: int, count: int = 3) -> list[Tensor]:
+    """Noise at points (3, R, C) [m]: three octaves from fine to coarse, and the fourth number, that of the colour."""
+    turn = point.new_tensor(_turns()[scale].T / (_VOXELS_M[scale] * _SIZE))
+    return _volume(point.device).at((turn @ point.flatten(1)).view_as(point), count)
 
 
 def _decay(scale: int) -> float:
@@ -90,7 +88,7 @@ def _widest(scale: int) -> float:
     return math.log(_FAINTEST / _AMPLITUDES[3 * scale + 2]) / _decay(scale)
 
 
-def _octaves(noise: tuple[Tensor, ...], spread: Tensor, scale: int) -> tuple[Tensor, Tensor]:
+def _octaves(noise: list[Tensor], spread: Tensor, scale: int) -> tuple[Tensor, Tensor]:
     """Sum of a scale's faded octaves, and its variance."""
     value, power = torch.zeros_like(spread), torch.zeros_like(spread)
     fade = (spread * _decay(scale)).exp_()
@@ -103,32 +101,29 @@ def _octaves(noise: tuple[Tensor, ...], spread: Tensor, scale: int) -> tuple[Ten
     return value, power
 
 
-def _log_albedo(point: Components, spread: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _log_albedo(point: Tensor, spread: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Sum of the faded octaves, its variance, and the noise of the colour, each (R, C).
 
     Args:
-        point: in the noise [m], (R, C) each.
+        point: in the noise [m], (3, R, C).
         spread: variance of the footprint [m²], (R, C).
     """
     last = len(_VOXELS_M) - 1
-
-    coarse = _noise(point, last)
+    coarse = _noise(point, last, 4)
     value, power = _octaves(coarse, spread, last)
     narrowest = spread.amin(1)
     for scale in range(last):
         # most pixels are too wide for the finest octaves: look up only where they are not
         rows = (narrowest < _widest(scale)).nonzero()[:, 0]
-        if len(rows) == 0:
-            continue
-        few = len(rows) < 0.9 * len(spread)
-        x, y, z, part = (p.index_select(0, rows) if few else p for p in (*point, spread))
-        own_value, own_power = _octaves(_noise((x, y, z), scale), part, scale)
-        if few:
-            value.index_add_(0, rows, own_value)
-            power.index_add_(0, rows, own_power)
-        else:
-            value.add_(own_value)
-            power.add_(own_power)
+        if 0 < len(rows) < 0.9 * len(spread):
+            some = torch.stack([part.index_select(0, rows) for part in point])
+            own = _octaves(_noise(some, scale), spread.index_select(0, rows), scale)
+            value.index_add_(0, rows, own[0])
+            power.index_add_(0, rows, own[1])
+        elif len(rows) > 0:
+            own = _octaves(_noise(point, scale), spread, scale)
+            value.add_(own[0])
+            power.add_(own[1])
     return value, power, coarse[3]
 
 
@@ -179,8 +174,8 @@ def colour(paint: Paint, geom: Tensor, point: Components, normal: Components, fo
     def told(table: Tensor) -> Tensor:  # (G,) of each point
         return table.index_select(0, which).view_as(geom)
 
-    x, y, z = (told(table).add_(part) for table, part in zip(paint.offset, point, strict=True))
-    log_albedo, power, tint = _log_albedo((x, y, z), (_PIXEL_SIGMA * footprint_m).square_())
+    solid = torch.stack([told(table).add_(part) for table, part in zip(paint.offset, point, strict=True)])
+    log_albedo, power, tint = _log_albedo(solid, (_PIXEL_SIGMA * footprint_m).square_())
     mix = tint.mul_(3).sigmoid_().mul_(0.65)
     albedo = torch.stack([torch.lerp(told(paint.look[k]), told(paint.look[3 + k]), mix) for k in range(3)])
     rows = (told(paint.can[0]).amax(1) > 0).nonzero()[:, 0]

@@ -35,45 +35,45 @@ class PeriodicVolume:
         # floors above each other, for OpenCV
         self._sheet = np.ascontiguousarray(closed.transpose(1, 2, 3, 0)).reshape(-1, self.size + 1, 4)
 
-    def at(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, ...]:
-        """The four numbers, by linear interpolation.
+    def at(self, places: Tensor, count: int = 4) -> list[Tensor]:
+        """The first numbers of each voxel, by linear interpolation.
 
         Args:
-            x: (R, C), places in periods, float32; any real numbers.
-            y: likewise.
-            z: likewise.
+            places: (3, R, C), x, y and z in periods, float32; any real numbers.
+            count: of the numbers, up to four.
 
         Returns:
-            Four tensors (R, C).
+            So many tensors (R, C).
         """
-        places = [part.sub(part.floor()) for part in (x, y, z)]
-        return self._by_opencv(*places) if x.device.type == "cpu" and _exact() else self._by_torch(*places)
+        within = places - places.floor()
+        found = self._by_opencv if places.device.type == "cpu" and _exact() else self._by_torch
+        return found(within, count)
 
-    def _by_torch(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, ...]:
-        grid = torch.stack([x, y, z], -1).mul_(2).sub_(1)
-        return F.grid_sample(self.values, grid[None, None], align_corners=True)[0, :, 0].unbind(0)
+    def _by_torch(self, places: Tensor, count: int) -> list[Tensor]:
+        grid = places.movedim(0, -1).mul(2).sub_(1)
+        return list(F.grid_sample(self.values[:, :count], grid[None, None], align_corners=True)[0, :, 0].unbind(0))
 
-    def _by_opencv(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, ...]:
+    def _by_opencv(self, places: Tensor, count: int) -> list[Tensor]:
         import cv2
 
-        z = z * self.size
-        floor = z.floor().clamp_(max=self.size - 1)
-        above = z.sub_(floor)
-        column, row = x * self.size, torch.add(floor, y, alpha=self.size / (self.size + 1)).mul_(self.size + 1)
+        column, row, above = places * self.size
+        floor = above.floor().clamp_(max=self.size - 1)
+        above = above.sub_(floor)
+        row = row.add_(floor, alpha=self.size + 1)
 
         def level(row: Tensor) -> Tensor:
-            found = np.empty((x.numel(), 1, 4), np.float32)
-            whole = x.numel() - x.numel() % _WIDTH
+            found = np.empty((column.numel(), 1, 4), np.float32)
+            whole = column.numel() - column.numel() % _WIDTH
             for part in (slice(0, whole), slice(whole, None)):
                 u, v = (flat.reshape(-1)[part].numpy() for flat in (column, row))
                 if len(u) > 0:
                     shape = (-1, min(_WIDTH, len(u)))
                     out = found[part].reshape(*shape, 4)
                     cv2.remap(self._sheet, u.reshape(shape), v.reshape(shape), cv2.INTER_LINEAR, dst=out)
-            return torch.from_numpy(found).view(*x.shape, 4)
+            return torch.from_numpy(found).view(*column.shape, 4)
 
         low, high = level(row), level(row.add_(self.size + 1))
-        return tuple(torch.lerp(low[..., k], high[..., k], above) for k in range(4))
+        return [torch.lerp(low[..., k], high[..., k], above) for k in range(count)]
 
 
 @lru_cache(maxsize=1)
