@@ -1,13 +1,15 @@
 """A run's folder is its own: of two writers one is refused, and a mistake leaves nothing in the way."""
 
 import json
+import shutil
 import threading
 
 import pytest
 
 from torchfovea.cli import main
-from torchfovea.commands.shared.manifest import MANIFEST
+from torchfovea.commands.shared.manifest import MANIFEST, keep, kept
 from torchfovea.files import create_json
+from torchfovea.setting import SettingError
 
 TINY = [
     "fidelity=geometric", "episodes=1", "saccades=2", "sensor.receptive_fields=400", "memory.cells=60", "picture=false",
@@ -97,10 +99,39 @@ def test_a_table_that_was_emptied_or_removed_is_noticed(tmp_path, capsys):
     for spoil in (lambda p: p.write_text(""), lambda p: p.unlink()):
         spoil(tmp_path / "run" / "episodes.csv")
         assert search(tmp_path / "run") == 1
-        assert "episodes.csv = 0 bytes: expected the " in capsys.readouterr().err
+        assert "episodes.csv = " in capsys.readouterr().err
     (tmp_path / "run" / "result.json").unlink()
     assert search(tmp_path / "run") == 0
     assert (tmp_path / "run" / "episodes.csv").stat().st_size > 0
+
+
+@pytest.mark.parametrize("name", ["result.json", "episodes.csv", "saccades.csv"])
+def test_a_digit_that_was_changed_is_noticed(made, tmp_path, name, capsys):
+    """By the run that is started again, and by the table of a sweep; the size of the file is what it was."""
+    spoilt = tmp_path / "runs" / "0" / name
+    shutil.copytree(made, spoilt.parent)
+    text = list(spoilt.read_text())
+    last = max(k for k, letter in enumerate(text) if letter.isdigit())
+    text[last] = str((int(text[last]) + 1) % 10)
+    spoilt.write_text("".join(text))
+    assert search(spoilt.parent) == 1
+    assert f"{name} = changed: expected what was written; remove " in capsys.readouterr().err
+    assert main(["collect", f"dir={spoilt.parents[1]}", f"hydra.run.dir={tmp_path / 'table'}"]) == 1
+    assert f"{name} = changed" in " ".join(capsys.readouterr().err.split())
+    (spoilt.parent / "result.json").unlink()
+    assert search(spoilt.parent) == 0 == search(spoilt.parent)
+
+
+def test_a_part_that_was_kept_is_read_whole_or_not_at_all(tmp_path):
+    path, content = tmp_path / "part.json", [{"gap": 0.1 + 0.2, "none": float("nan"), "name": "µ"}]
+    keep(path, content)
+    assert kept(path) == [{"gap": 0.1 + 0.2, "none": None, "name": "µ"}]
+    text = path.read_text()
+    spoilt = text.replace("0.30000000000000004", "0.30000000000000016"), text[:-9], "[]", '{"content": 1}', ""
+    for k in spoilt:
+        path.write_text(k)
+        with pytest.raises(SettingError, match=r"part.json = corrupt: expected .* remove it to make it again"):
+            kept(path)
 
 
 @pytest.mark.parametrize(

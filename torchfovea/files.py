@@ -21,6 +21,7 @@ except ImportError:  # not on Windows
 __all__ = [
     "clear_unfinished",
     "create_json",
+    "json_text",
     "replacing",
     "write_csv",
     "write_figure",
@@ -139,7 +140,7 @@ def write_json(path: str | os.PathLike[str], content: Any) -> None:
         TypeError: for content that JSON has no form for; nothing is written then.
     """
     with replacing(path) as temporary:
-        temporary.write_text(_json(content), encoding="utf-8")
+        temporary.write_text(json_text(content), encoding="utf-8")
 
 
 def create_json(path: str | os.PathLike[str], content: Any) -> bool:
@@ -154,7 +155,7 @@ def create_json(path: str | os.PathLike[str], content: Any) -> bool:
     """
     path = Path(path)
     with _named(path), _temporary(path) as temporary:
-        temporary.write_text(_json(content), encoding="utf-8")
+        temporary.write_text(json_text(content), encoding="utf-8")
         _open_to_others(temporary)
         try:
             os.link(temporary, path)
@@ -163,7 +164,8 @@ def create_json(path: str | os.PathLike[str], content: Any) -> bool:
     return True
 
 
-def _json(content: Any) -> str:
+def json_text(content: Any) -> str:
+    """What `write_json` writes."""
     return json.dumps(_plain(content), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-__all__ = ["SettingError", "require"]
+import re
+
+__all__ = ["SettingError", "require", "require_name"]
 
 
 class SettingError(ValueError):
@@ -23,3 +25,13 @@ def require(condition: bool, setting: str, value: object, expected: str) -> None
     """
     if not condition:
         raise SettingError(f"{setting} = {value}: expected {expected}")
+
+
+def require_name(name: object, setting: str) -> None:
+    """Check a user's name for something, of which names of files are made: none of them may lead out of their folder.
+
+    Raises:
+        SettingError: for what is no text, is empty, begins with a dot or holds what separates folders.
+    """
+    good = isinstance(name, str) and re.fullmatch(r"[^./\\:\0][^/\\:\0]*", name) is not None
+    require(good, setting, name, "a name, without a path")

@@ -11,7 +11,7 @@ import os
 import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ __all__ = [
     "MOST_BYTES",
     "MOST_PIXELS",
     "Damaged",
+    "path_within",
     "read_arrays",
     "read_grey_pfm",
     "read_pixels",
@@ -45,6 +46,18 @@ def _one_error() -> Iterator[None]:
         raise
     except Exception as error:  # zipfile, zlib, tokenize and NumPy each have their own
         raise Damaged(" ".join(str(error).split())[:160] or type(error).__name__) from error
+
+
+def path_within(folder: Path, name: str) -> Path:
+    """The file that data name by its path in their folder.
+
+    Raises:
+        Damaged: for a path that leads out of the folder.
+    """
+    path = PureWindowsPath(name)  # which knows the separators of all systems, and drives
+    if path.drive or path.root or ".." in path.parts:
+        raise Damaged("a path out of the folder")
+    return folder / name
 
 
 def read_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from torchfovea.commands.shared.config import run_folder
-from torchfovea.commands.shared.manifest import MANIFEST, read_result
+from torchfovea.commands.shared.manifest import MANIFEST, read_result, unchanged
 from torchfovea.files import write_csv, write_result
 from torchfovea.setting import SettingError, require
 
@@ -76,4 +76,6 @@ def _overrides(folder: Path) -> dict[str, str]:
 def _figures(folder: Path) -> dict[str, Any]:
     """The run's figures that are single numbers or words."""
     result = read_result(folder / "result.json")
+    if (folder / MANIFEST).exists():
+        unchanged(folder)
     return {key: value for key, value in result.items() if not isinstance(value, dict | list)}

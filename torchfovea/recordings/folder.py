@@ -25,6 +25,7 @@ from torchfovea.recordings.poses import Pose, ahead, matrix_from_quaternion, qua
 from torchfovea.sensing.camera import Camera
 from torchfovea.sensing.head import Gaze
 from torchfovea.setting import SettingError, require
+from torchfovea.untrusted import Damaged, path_within
 
 __all__ = ["COLUMNS", "Folder", "Recorder"]
 
@@ -144,7 +145,7 @@ class Folder:
         """Width and height of the first image."""
         names = [row[side] for row in self._rows for side in _IMAGES[1:] if row[side]]
         require(bool(names), "recording", self._table, "at least one image")
-        height, width = read_picture(self.folder / names[0]).shape[-2:]
+        height, width = self._picture(names[0]).shape[-2:]
         return width, height
 
     def __len__(self) -> int:
@@ -172,10 +173,16 @@ class Folder:
                 refuse(SettingError(f"{self._table}, frame {k}: {error}"))
             yield Moment(max(time_s, then), left, right, gaze, base)
 
+    def _picture(self, name: str) -> Tensor:
+        try:
+            return read_picture(path_within(self.folder, name))
+        except Damaged as error:
+            raise SettingError(f"frame = {name}: expected an image within {self.folder} ({error})") from error
+
     def _image(self, name: str) -> Tensor | None:
         if not name:
             return None
-        image, (width, height) = read_picture(self.folder / name), self.calibration.size_px
+        image, (width, height) = self._picture(name), self.calibration.size_px
         size = (image.shape[-1], image.shape[-2])
         require(size == (width, height), f"size of {name}", size, f"{(width, height)}, the calibration's")
         return image

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchfovea.gaussian import columns
 from torchfovea.sensing.head import Head, fixate
-from torchfovea.setting import require
+from torchfovea.setting import require, require_name
 
 __all__ = ["Distribution", "Hits", "Scenes", "draw_scenes", "first_surfaces", "nearest_point", "stream"]
 
@@ -76,6 +76,7 @@ class Distribution:
 
     def __post_init__(self) -> None:
         """Raise SettingError for values out of range; lists become tuples."""
+        require_name(self.name, "distribution.name")
         whole = isinstance(self.cans, int) and 2 <= self.cans <= 40
         require(whole, "distribution.cans", self.cans, "a whole number from 2 to 40")
         regions = tuple(tuple(float(v) for v in region) for region in self.regions)

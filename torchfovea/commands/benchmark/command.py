@@ -25,6 +25,7 @@ from torchfovea.commands.benchmark.report import leaderboard, read_records
 from torchfovea.commands.benchmark.tracks import TIMES, Unit, run_unit
 from torchfovea.commands.shared.composed import config_folders
 from torchfovea.commands.shared.config import run_folder
+from torchfovea.commands.shared.manifest import keep, kept
 from torchfovea.commands.shared.mistakes import describe
 from torchfovea.commands.shared.parallel import spread, workers_of
 from torchfovea.commands.shared.progress import progress_bar
@@ -106,10 +107,13 @@ def _file_name(name: str) -> str:
     return plain if plain == name else f"{plain}-{_hash(name)[:6]}"
 
 
-def _outcomes(units: list[Unit], told: list[dict[str, Any]], kept: Path, workers: int, backend: str) -> list[Outcome]:
+def _outcomes(
+    units: list[Unit], told: list[dict[str, Any]], units_at: Path, workers: int, backend: str
+) -> list[Outcome]:
     """What became of every unit: its rows or its error; those that the folder holds already are read."""
     paths = [
-        kept / f"{unit.entry.track}-{unit.family}-{_hash(what)}.json" for unit, what in zip(units, told, strict=True)
+        units_at / f"{unit.entry.track}-{unit.family}-{_hash(what)}.json"
+        for unit, what in zip(units, told, strict=True)
     ]
     missing = [k for k, path in enumerate(paths) if not path.exists()]
     with progress_bar() as progress:
@@ -118,7 +122,7 @@ def _outcomes(units: list[Unit], told: list[dict[str, Any]], kept: Path, workers
             k = missing[n]
             if isinstance(outcome, Exception):
                 raise outcome
-            write_json(paths[k], {**told[k], **outcome})
+            keep(paths[k], {**told[k], **outcome})
             if outcome["error"] is not None:
                 line = f"benchmark: {units[k].entry.name} in {units[k].family}: {outcome['error']}"
                 progress.console.print(line, highlight=False, markup=False, soft_wrap=True)
@@ -127,11 +131,8 @@ def _outcomes(units: list[Unit], told: list[dict[str, Any]], kept: Path, workers
 
 
 def _read(path: Path) -> Outcome:
-    try:
-        outcome: Outcome = json.loads(path.read_text(encoding="utf-8"))
-        outcome["rows"], outcome["error"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise SettingError(f"{path} = corrupt ({error}): expected a unit's rows; remove it to run it again") from None
+    outcome: Outcome = kept(path)
+    require({"rows", "error"} <= set(outcome), str(path), "corrupt", "a unit's rows; remove it to run it again")
     return outcome
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import asdict
 from functools import partial
@@ -20,12 +19,12 @@ from torchfovea.commands.reproduce.report import decidable, shown, write_report
 from torchfovea.commands.shared.build import whole
 from torchfovea.commands.shared.composed import config_folders
 from torchfovea.commands.shared.config import run_folder
-from torchfovea.commands.shared.manifest import complete, finished
+from torchfovea.commands.shared.manifest import complete, finished, keep, kept
 from torchfovea.commands.shared.mistakes import describe
 from torchfovea.commands.shared.parallel import spread, workers_of
 from torchfovea.commands.shared.progress import progress_bar
 from torchfovea.files import write_csv, write_json
-from torchfovea.setting import SettingError
+from torchfovea.setting import SettingError, require
 
 __all__ = ["run"]
 
@@ -115,7 +114,7 @@ def _episodes(tasks: list[CellTask], folder: Path, workers: int, backend: str) -
                 failed.append(name)
                 progress.console.print(f"reproduce: {name}: {line}", highlight=False, markup=False, soft_wrap=True)
             else:
-                write_json(folder / f"{name}.json", outcome)
+                keep(folder / f"{name}.json", outcome)
                 rows += outcome
             progress.advance(bar)
     if failed:
@@ -128,13 +127,9 @@ def _episodes(tasks: list[CellTask], folder: Path, workers: int, backend: str) -
 
 
 def _read(path: Path, task: CellTask) -> list[Row]:
-    try:
-        rows: list[Row] = json.loads(path.read_text(encoding="utf-8"))
-        complete = len(rows) == len(task.seeds) * max(1, len(task.alphas)) and all("gap_final" in row for row in rows)
-    except (ValueError, TypeError):
-        complete = False
-    if not complete:
-        raise SettingError(f"{path} = corrupt: expected the rows of its episodes; remove it to run them again")
+    rows: list[Row] = kept(path)
+    whole = len(rows) == len(task.seeds) * max(1, len(task.alphas)) and all("gap_final" in row for row in rows)
+    require(whole, str(path), f"{len(rows)} rows", "those of its episodes; remove it to run them again")
     return rows
 
 

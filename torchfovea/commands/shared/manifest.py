@@ -11,10 +11,23 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from torchfovea.files import clear_unfinished, create_json, replacing, write_json, write_result
+from torchfovea.files import clear_unfinished, create_json, json_text, replacing, write_json, write_result
 from torchfovea.setting import SettingError, require
+from torchfovea.untrusted import Damaged, path_within
 
-__all__ = ["MANIFEST", "complete", "config_hash", "finished", "read_result", "record", "unclaimed", "withdraw"]
+__all__ = [
+    "MANIFEST",
+    "complete",
+    "config_hash",
+    "finished",
+    "keep",
+    "kept",
+    "read_result",
+    "record",
+    "unchanged",
+    "unclaimed",
+    "withdraw",
+]
 
 MANIFEST = "manifest.json"
 # what does not change a run's figures
@@ -74,20 +87,62 @@ def finished(cfg: DictConfig, folder: Path, score: str = "gap_per_saccade") -> f
     value = figures.get(score)
     whole = score in figures and (value is None or isinstance(value, int | float))
     require(whole, f"{result}: {score}", value, "a number; remove the file to run again")
-    for name, size in before.get("tables", {}).items():
-        table = folder / name
-        found = table.stat().st_size if table.is_file() else 0
-        require(
-            found == size, str(table), f"{found} bytes", f"the {size} that were written; remove {result} to run again"
-        )
+    unchanged(folder)
     return float("nan") if value is None else float(value)
 
 
 def complete(folder: Path, figures: Mapping[str, Any]) -> None:
-    """Write result.json, which says that a run is complete; before it, the sizes of its tables, into the manifest."""
-    tables = {path.name: path.stat().st_size for path in sorted(folder.glob("*.csv"))}
-    write_json(folder / MANIFEST, {**_read_manifest(folder / MANIFEST), "tables": tables})
+    """Write result.json, which says that a run is complete; before it, what it and the tables hold, into the manifest.
+
+    A later change of a single digit is noticed by `unchanged`.
+    """
+    sums = {path.name: _sum(path.read_bytes()) for path in sorted(folder.glob("*.csv"))}
+    sums["result.json"] = _sum(json_text(figures).encode())
+    write_json(folder / MANIFEST, {**_read_manifest(folder / MANIFEST), "sha256": sums})
     write_result(folder, figures)
+
+
+def unchanged(folder: Path) -> None:
+    """Compare a complete run's result and tables with what its manifest says was written.
+
+    Raises:
+        SettingError: for the first that is another; it names the file.
+    """
+    sums = _read_manifest(folder / MANIFEST).get("sha256", {})
+    require(isinstance(sums, dict), f"{folder / MANIFEST}: sha256", sums, "the sums of files")
+    for name, written in sums.items():
+        try:
+            path = path_within(folder, name)
+        except Damaged as error:
+            raise SettingError(f"{folder / MANIFEST}: {name}: expected a file of the run ({error})") from None
+        found = _sum(path.read_bytes()) if path.is_file() else None
+        state = "missing" if found is None else "changed"
+        require(found == written, str(path), state, f"what was written; remove {folder / 'result.json'} to run again")
+
+
+def keep(path: Path, content: Any) -> None:
+    """Write a part of a run's work as JSON, which `kept` reads when the run goes on."""
+    write_json(path, {"sha256": _sum(json_text(content).encode()), "content": content})
+
+
+def kept(path: Path) -> Any:
+    """What `keep` wrote.
+
+    Raises:
+        SettingError: for anything else, be it another digit; it names the file.
+    """
+    try:
+        part = json.loads(path.read_text(encoding="utf-8"))
+        whole = part["sha256"] == _sum(json_text(part["content"]).encode())
+    except (ValueError, KeyError, TypeError, RecursionError):
+        whole = False
+    if not whole:
+        raise SettingError(f"{path} = corrupt: expected what was written; remove it to make it again")
+    return part["content"]
+
+
+def _sum(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
 
 
 def unclaimed(folder: Path) -> None:

@@ -22,7 +22,7 @@ from torchfovea.commands.shared.config import conf_dir
 from torchfovea.commands.shared.settings import construct
 from torchfovea.commands.shared.trust import load_trusted
 from torchfovea.imported import load_function
-from torchfovea.setting import SettingError, require
+from torchfovea.setting import SettingError, require, require_name
 
 __all__ = ["build_named", "name_of", "targets_of"]
 
@@ -37,7 +37,7 @@ def name_of(cfg: DictConfig, group: str, key: str = "name") -> str:
             another is ``group=name``.
     """
     name = OmegaConf.select(cfg, f"{group}.{key}")
-    require(isinstance(name, str) and bool(name), f"{group}.{key}", name, "a name, for pictures and tables")
+    require_name(name, f"{group}.{key}")
     target = OmegaConf.select(cfg, f"{group}._target_")
     ours = targets_of(group, key)
     unknown = target is None and OmegaConf.select(cfg, f"{group}.source") is None
