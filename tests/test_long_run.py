@@ -1,10 +1,17 @@
 """A short part of what `scripts/long_run.py` does for long: float32 holds, memory and time do not grow."""
 
+import gc
 import importlib.util
 import math
 from pathlib import Path
 
 import pytest
+import torch
+from hydra import compose, initialize_config_dir
+
+from torchfovea.commands.shared.build import build_observer
+from torchfovea.commands.shared.config import conf_dir
+from torchfovea.commands.shared.rollout import one_episode
 
 
 @pytest.fixture(scope="module")
@@ -37,3 +44,17 @@ def test_an_episode_of_hundreds_of_saccades_grows_in_nothing_but_knowledge(scrip
     assert all(math.isfinite(value) for value in informed) and sorted(informed) == informed
     assert tenths[-1].resident_mb - tenths[2].resident_mb < 20
     assert tenths[-1].cpu_ms < 5 * min(tenth.cpu_ms for tenth in tenths[1:])
+
+
+def test_an_episode_keeps_numbers_and_no_tensors_of_every_saccade(script):
+    """A tensor of one number takes half a kilobyte, and there are fifteen a saccade."""
+    seen = []
+
+    def count(t, glance):
+        if t in (70, 138):
+            seen.append(sum(issubclass(type(thing), torch.Tensor) for thing in gc.get_objects()))
+
+    with initialize_config_dir(conf_dir(), version_base="1.3"):
+        cfg = compose("search", overrides=[*script.SMALL, "saccades=140"])
+        one_episode(cfg, build_observer(cfg), 0, count)
+    assert seen[1] - seen[0] < 40

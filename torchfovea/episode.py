@@ -13,19 +13,21 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchfovea.arena import Arena, Arenas, Fixation, Truth
+from torchfovea.arena import Arena, Arenas, Truth
 from torchfovea.deciding.strategies import Strategy, upper_confidence_bound
 from torchfovea.memory.egosphere import Memory
 from torchfovea.metrics import gap, global_information, local_information, near_target, regret, saccades_to_target
 from torchfovea.perception import Observer, Step
 from torchfovea.rows import row, stack
-from torchfovea.search import Glance, Look, Move, StopRule, search
+from torchfovea.search import Glance, Look, StopRule, search
 from torchfovea.sensing.head import Gaze, gaze_point
 from torchfovea.setting import require
 
 __all__ = ["Each", "Episode", "Rules", "run_episode", "run_episodes"]
 
 Each = Callable[[int, Glance], None]
+
+_JOINED = 64  # saccades
 
 
 class Episode(NamedTuple):
@@ -158,12 +160,8 @@ def run_episodes(
     for truth in truths:
         require(0 < truth.nearest_m < far_m, "far_m", far_m, f"more than the nearest range, {truth.nearest_m:.3f} m")
     near, best_m = _near(truths, memory, rules), _best(truths, far_m)
-    bests: list[Tensor] = []
     known = torch.ones(len(truths), dtype=torch.bool)
-    moves: list[Move] = []
-    fixations: list[Fixation] = []
-    gathered: list[Tensor] = []
-    local: list[Tensor] = []
+    course, informed = _Course(len(truths)), _Course(len(truths))
     looks, compute = torch.zeros(len(truths), device=memory.cells.device), 0.0
     for t, glance in enumerate(search(arena, observer, memory, saccades, generators, rules.strategy, rules.stop)):
         if glance.move.base is not None:
@@ -171,40 +169,27 @@ def run_episodes(
             truths = arena.truths(memory.cells)  # type: ignore[attr-defined]
             near, best_m = _near(truths, memory, rules), _best(truths, far_m)
         known &= near.any(-1).cpu()
-        bests.append(best_m)
-        moves.append(glance.move)
-        fixations.append(arena.fixation(glance.move.gaze))
+        move, at = glance.move, arena.fixation(glance.move.gaze)
+        course.add(*move.gaze, move.seconds, move.degrees, at.range_m, at.is_floor, at.is_target, best_m, at.point)
         if glance.look is None:
             break
         look, step = glance.look, glance.step
         looks, compute = looks + glance.looked, compute + glance.seconds
-        gathered.append(global_information(step.points.cov))
-        local.append(local_information(step.points.cov, near)[0])
+        informed.add(global_information(step.points.cov), local_information(step.points.cov, near)[0])
         if each is not None:
             each(t, glance)
-    # after the search the heads stay where they are
-    still = moves[-1]._replace(seconds=0 * moves[-1].seconds, degrees=0 * moves[-1].degrees)
-    moves += [still] * (saccades - len(moves))
-    fixations += fixations[-1:] * (saccades - len(fixations))
-    bests += bests[-1:] * (saccades - len(bests))
-    gathered, local = (course + course[-1:] * (saccades - len(course)) for course in (gathered, local))
-
-    def over_time(parts: Sequence[Any]) -> Tensor:
-        return torch.stack([torch.as_tensor(part).cpu() for part in parts], -1)
-
-    ranges = over_time([f.range_m for f in fixations]).double()
-    hit = over_time([f.is_target for f in fixations])
+    numbers = course.until(saccades)
+    *angles, seconds, degrees, ranges, floor, target, best_now = numbers[..., :9].unbind(-1)
+    points, gazes = numbers[..., 9:], Gaze(*angles)
+    hit = target > 0
     # where a class is sought, whatever is not of it is worth no more than the floor
-    nothing = over_time([f.is_floor for f in fixations]) if observer.classes is None else ~hit
+    nothing = floor > 0 if observer.classes is None else ~hit
     reward = -torch.where(nothing, torch.inf, ranges).clamp(max=far_m)
-    points = torch.stack([f.point.double().cpu() for f in fixations], 1)
-    gazes = [over_time(angle).double() for angle in zip(*(move.gaze for move in moves), strict=True)]
-    aimed = gaze_point(observer.head, Gaze(*gazes)).norm(dim=-1)
-    informed = over_time(gathered).double()
-    locally = over_time(local).double()
-    best_now = over_time(bests)
+    aimed = gaze_point(observer.head, gazes).norm(dim=-1)
+    globally, locally = informed.until(saccades).unbind(-1)
     moved = bool((best_now != best_now[:, :1]).any())
-    far_travelled, took = (over_time([m[k] for m in moves]).double().sum(-1) for k in (2, 1))
+    # after the search the heads stay where they are
+    far_travelled, took = (part[:, : course.count].sum(-1) for part in (degrees, seconds))
     episodes = []
     for b, truth in enumerate(truths):
         best = best_now[b].max()
@@ -218,7 +203,7 @@ def run_episodes(
                 reward=reward[b],
                 gap=gap(reward[b], best),
                 regret=regret(reward[b] - best_now[b], 0 * best) if moved else regret(reward[b], best),
-                global_information=informed[b],
+                global_information=globally[b],
                 local_information=locally[b] if bool(known[b]) else None,
                 hit=hit[b],
                 moves=int(saccades_to_target(hit[b])),
@@ -232,6 +217,35 @@ def run_episodes(
             )
         )
     return episodes
+
+
+class _Course:
+    """Numbers of every saccade of B episodes, (B, T, k) float64 in the end.
+
+    They are joined now and then: a small tensor is a hundred times as large as the number in it.
+    """
+
+    def __init__(self, episodes: int) -> None:
+        self.episodes, self.count = episodes, 0
+        self.rows: list[Tensor] = []
+        self.blocks: list[Tensor] = []
+
+    def add(self, *parts: Any) -> None:
+        """One saccade's numbers, (B,) each or one for all, and vectors (B, m)."""
+        device = next((part.device for part in parts if isinstance(part, Tensor)), None)
+        numbers = [torch.as_tensor(part, dtype=torch.float64, device=device) for part in parts]
+        flat = [n if n.dim() == 2 else n.expand(self.episodes)[:, None] for n in numbers]
+        self.rows.append(torch.cat(flat, -1))
+        self.count += 1
+        if len(self.rows) == _JOINED:
+            self.blocks.append(torch.stack(self.rows, 1))
+            self.rows = []
+
+    def until(self, saccades: int) -> Tensor:
+        """The course on the CPU, its last numbers repeated up to T."""
+        rows = [torch.stack(self.rows, 1)] if self.rows else []
+        course = torch.cat([*self.blocks, *rows], 1).cpu()
+        return torch.cat([course, course[:, -1:].expand(-1, saccades - self.count, -1)], 1)
 
 
 def _near(truths: Sequence[Truth], memory: Memory, rules: Rules) -> Tensor:
