@@ -1,0 +1,131 @@
+"""Corners that the mutation check (scripts/mutants.py) found no other test to stand in."""
+
+import math
+
+import pytest
+import torch
+
+import torchfovea as tf
+from torchfovea import metrics
+from torchfovea.deciding import reward
+from torchfovea.gaussian import Gaussian, Information, columns
+from torchfovea.memory.egosphere import (
+    Fusion,
+    Prior,
+    cartesian_from_patches,
+    empty_memory,
+    inverse_range_belief,
+    reducible,
+    trust,
+)
+from torchfovea.memory.sphere import fibonacci_directions
+from torchfovea.memory.update import remember
+from torchfovea.sensing.triangulation import Observations, triangulate_rectified
+from torchfovea.setting import SettingError
+
+CELLS = fibonacci_directions(12, torch.float64)
+
+
+def test_one_bad_direction_among_good_ones_is_refused():
+    cells = CELLS.clone()
+    cells[3] *= 1.1
+    with pytest.raises(SettingError, match="cells = directions: expected finite unit vectors"):
+        empty_memory(cells, Prior())
+
+
+def test_what_is_at_the_limit_of_a_setting_is_taken():
+    assert Fusion(gate_deg=0, gate_spacing=0).gate_deg == 0
+    assert Fusion(conflict=0.5).votes and Fusion(nearest_m=0.05).nearest_m == 0.05 and Fusion(half_life=0.5)
+    assert Fusion(window=1.0).window == 1 and Prior(std=1e9, mean=1e-9).std == 1e9
+    for wrong in ({"std": 1.5e9}, {"mean": 9e-10}):
+        with pytest.raises(SettingError, match="1e-9 to 1e9"):
+            Prior(**wrong)
+    with pytest.raises(SettingError, match=r"fusion.gate_deg = 1500000"):
+        Fusion(gate_deg=1.5e6)
+
+
+def test_patches_lie_within_a_kilometre():
+    memory = empty_memory(CELLS, Prior())
+    zero = torch.zeros(12, dtype=torch.float64)
+    for rho in (zero, zero - 0.3, zero + 1e-4):
+        assert torch.allclose(cartesian_from_patches(rho, zero + 1e-6, memory).mean.norm(dim=-1), zero + 1000)
+
+
+def test_what_looks_may_take_away_is_what_they_average():
+    """Of (Λ − q + a²)/Λ², with a and q the sums over looks of √l/u and l/u², the part (Λ − q)/Λ²."""
+    generator = torch.Generator().manual_seed(0)
+    looks = torch.rand(12, 5, generator=generator, dtype=torch.float64) * 1e-3 + 1e-4  # variances u
+    lasts = looks * torch.rand(12, 5, generator=generator, dtype=torch.float64)  # and what of them lasts, l
+    total, once, twice = (1 / looks).sum(-1), (lasts.sqrt() / looks).sum(-1), (lasts / looks**2).sum(-1)
+    memory, zero = empty_memory(CELLS, Prior()), torch.zeros(12, dtype=torch.float64)
+    matrix = columns(zero + 1, zero, zero, zero + 1, zero, total)
+    memory = memory._replace(information=Information(memory.information.vector, matrix), lasting=columns(once, twice))
+    variance = inverse_range_belief(memory)[1]
+    assert torch.allclose(variance, (total - twice + once**2) / total**2)
+    assert torch.allclose(reducible(memory, variance), (total - twice) / (total - twice + once**2))
+
+
+def test_points_that_were_seen_are_trusted():
+    """Nobody votes against them: every observation of a Cartesian memory is believed."""
+    memory = empty_memory(CELLS, Prior(), "cartesian")
+    seen = CELLS[[2, 7]]
+    cov = torch.tensor([1e-4, 0, 0, 1e-4, 0, 1e-4], dtype=torch.float64).expand(2, 6)
+    support = torch.full((2,), 1e-3, dtype=torch.float64)
+    one = Observations(0.5 * seen, cov, seen, support, torch.tensor([True, True]), None, "cartesian")
+    for _ in range(2):
+        memory = remember(memory, one, Fusion("aligned"))
+    expected = torch.zeros(12, dtype=torch.float64)
+    expected[[2, 7]] = 1
+    assert torch.equal(trust(memory), expected) and torch.equal(memory.votes[..., 0], 2 * expected)
+    assert torch.equal(memory.votes[..., 1], 0 * expected)
+
+
+def test_what_is_not_valid_is_of_unit_size():
+    """So that whoever forgets the mask divides by no zero; and supports are those of all fields of a batch."""
+    observer = tf.Observer(retina=tf.LogPolar(60))
+    px = observer.retina.centers_px().expand(2, 60, 2)
+    sigma = torch.full((2, 60), 0.3)
+    valid = torch.arange(60).expand(2, 60) % 3 > 0
+    gaze = tf.Gaze(*(torch.tensor(v).expand(2) for v in (0.0, 0.1, 0.2)))
+    matches = tf.Correspondences(px, px - torch.tensor([4.0, 0.0]), sigma, sigma, valid)
+    for chart in ("inverse_range", "cartesian"):
+        seen = tf.observe(matches, tf.eyes(observer.head, gaze), observer.camera, torch.ones(60), chart=chart)
+        gone = ~seen.valid
+        unit = torch.tensor([1.0, 0, 0, 1, 0, 1])
+        assert bool(gone.any()) and bool((seen.mean[gone] == 1).all()) and bool((seen.cov[gone] == unit).all())
+        assert seen.support_rad.shape == (2, 60)
+
+
+def test_rays_that_look_back_give_finite_points():
+    ahead, back = torch.tensor([0.1, 0.2, 1.0]), torch.tensor([0.1, 0.2, -1.0])
+    for left, right in ((ahead, back), (back, ahead), (back, back)):
+        point, weight, seen = triangulate_rectified(left, right, torch.tensor(0.1))
+        assert not bool(seen) and bool(torch.isfinite(point / weight).all())
+
+
+def test_a_class_that_is_sought_scales_the_reward():
+    """Against draws of the share and of the surface, which are independent."""
+    generator = torch.Generator().manual_seed(0)
+    share, spread, mean, std = 0.3, 0.1, 2.0, 0.5
+    drawn = torch.randn(2, 2_000_000, generator=generator, dtype=torch.float64)
+    product = (share + spread * drawn[0]) * (mean + std * drawn[1])
+    number = [torch.tensor(v, dtype=torch.float64) for v in (mean, std, share, spread**2)]
+    found = reward.of_class(reward.RewardBelief(*number[:2]), *number[2:])
+    assert found.mean.item() == pytest.approx(product.mean().item(), abs=1e-3)
+    assert found.std.item() == pytest.approx(product.std().item(), abs=1e-3)
+
+
+def test_metrics_at_their_limits():
+    """Exact numbers, so that a limit that belongs to the other side would show."""
+    number = torch.tensor
+    assert metrics.phantom(number([1.0, 1.0]), number([2.0, math.inf]), 0.5).tolist() == [False, True]
+    points, target = torch.tensor([[0.5, 0, 0], [0.25, 0, 0]]), torch.zeros(3)
+    assert metrics.near_target(points, target, 0.5).tolist() == [False, True]
+    assert metrics.nees_mean(number([2.0])).item() == 4 and metrics.outlier_share(number([2.0])).item() == 0
+    with pytest.raises(SettingError, match="covariance yy = -3"):
+        metrics.information(number([[1.0, 0, 0, 2, 0, 1], [1.0, 0, 0, -3, 0, 1]]))
+    # singular: the second pivot is what float32 could not resolve of a diagonal entry of 9
+    flat = number([4.0, 6, 0, 9, 0, 1])
+    expected = -math.log(4 * 9 * torch.finfo(torch.float32).eps)
+    assert metrics.information(flat).item() == pytest.approx(expected, rel=1e-6)
+    assert bool(torch.isfinite(reward.range_reward(Gaussian(torch.zeros(3), flat)).std))
