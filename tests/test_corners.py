@@ -129,3 +129,25 @@ def test_metrics_at_their_limits():
     expected = -math.log(4 * 9 * torch.finfo(torch.float32).eps)
     assert metrics.information(flat).item() == pytest.approx(expected, rel=1e-6)
     assert bool(torch.isfinite(reward.range_reward(Gaussian(torch.zeros(3), flat)).std))
+
+
+def test_evidence_of_class_enters_a_memory_that_asks_for_it():
+    seen = CELLS[[2, 7]]
+    one = Observations(
+        torch.tensor([[0.0, 0, 2], [0, 0, 3]], dtype=torch.float64),
+        torch.tensor([1e-4, 0, 0, 1e-4, 0, 1e-2], dtype=torch.float64).expand(2, 6),
+        seen,
+        torch.full((2,), 1e-3, dtype=torch.float64),
+        torch.tensor([True, True]),
+    )
+    evidence = torch.tensor([[0.1, 0.9], [0.9, 0.1]], dtype=torch.float64)
+    blind = empty_memory(CELLS, Prior())
+    asking = blind._replace(classes=torch.full((12, 2), 0.1, dtype=torch.float64))
+    assert remember(blind, one, Fusion(), evidence=evidence).classes is None
+    assert torch.equal(remember(asking, one, Fusion()).classes, asking.classes)
+    shares = remember(asking, one, Fusion(), evidence=evidence).classes
+    shares = shares[:, 1] / shares.sum(-1)
+    # prior mean plus one observation's weight, of a concentration of 0.2: (0.1 + 0.9)/(0.2 + 1)
+    expected = torch.full((12,), 0.5, dtype=torch.float64)
+    expected[[2, 7]] = torch.tensor([1.0, 0.2], dtype=torch.float64) / 1.2
+    assert torch.allclose(shares, expected)

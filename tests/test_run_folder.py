@@ -7,7 +7,7 @@ import threading
 import pytest
 
 from torchfovea.cli import main
-from torchfovea.commands.shared.manifest import MANIFEST, keep, kept
+from torchfovea.commands.shared.manifest import MANIFEST, read_kept, write_kept
 from torchfovea.files import create_json
 from torchfovea.setting import SettingError
 
@@ -124,14 +124,14 @@ def test_a_digit_that_was_changed_is_noticed(made, tmp_path, name, capsys):
 
 def test_a_part_that_was_kept_is_read_whole_or_not_at_all(tmp_path):
     path, content = tmp_path / "part.json", [{"gap": 0.1 + 0.2, "none": float("nan"), "name": "µ"}]
-    keep(path, content)
-    assert kept(path) == [{"gap": 0.1 + 0.2, "none": None, "name": "µ"}]
+    write_kept(path, content)
+    assert read_kept(path) == [{"gap": 0.1 + 0.2, "none": None, "name": "µ"}]
     text = path.read_text()
     spoilt = text.replace("0.30000000000000004", "0.30000000000000016"), text[:-9], "[]", '{"content": 1}', ""
     for k in spoilt:
         path.write_text(k)
         with pytest.raises(SettingError, match=r"part.json = corrupt: expected .* remove it to make it again"):
-            kept(path)
+            read_kept(path)
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from torchfovea.commands.benchmark.report import leaderboard, read_records
 from torchfovea.commands.benchmark.tracks import TIMES, Unit, run_unit
 from torchfovea.commands.shared.composed import config_folders
 from torchfovea.commands.shared.config import run_folder
-from torchfovea.commands.shared.manifest import keep, kept
+from torchfovea.commands.shared.manifest import read_kept, write_kept
 from torchfovea.commands.shared.mistakes import describe
 from torchfovea.commands.shared.parallel import spread, workers_of
 from torchfovea.commands.shared.progress import progress_bar
@@ -122,7 +122,7 @@ def _outcomes(
             k = missing[n]
             if isinstance(outcome, Exception):
                 raise outcome
-            keep(paths[k], {**told[k], **outcome})
+            write_kept(paths[k], {**told[k], **outcome})
             if outcome["error"] is not None:
                 line = f"benchmark: {units[k].entry.name} in {units[k].family}: {outcome['error']}"
                 progress.console.print(line, highlight=False, markup=False, soft_wrap=True)
@@ -131,7 +131,7 @@ def _outcomes(
 
 
 def _read(path: Path) -> Outcome:
-    outcome: Outcome = kept(path)
+    outcome: Outcome = read_kept(path)
     require({"rows", "error"} <= set(outcome), str(path), "corrupt", "a unit's rows; remove it to run it again")
     return outcome
 

@@ -19,7 +19,7 @@ from torchfovea.commands.reproduce.report import decidable, shown, write_report
 from torchfovea.commands.shared.build import whole
 from torchfovea.commands.shared.composed import config_folders
 from torchfovea.commands.shared.config import run_folder
-from torchfovea.commands.shared.manifest import complete, finished, keep, kept
+from torchfovea.commands.shared.manifest import complete, finished, read_kept, write_kept
 from torchfovea.commands.shared.mistakes import describe
 from torchfovea.commands.shared.parallel import spread, workers_of
 from torchfovea.commands.shared.progress import progress_bar
@@ -114,7 +114,7 @@ def _episodes(tasks: list[CellTask], folder: Path, workers: int, backend: str) -
                 failed.append(name)
                 progress.console.print(f"reproduce: {name}: {line}", highlight=False, markup=False, soft_wrap=True)
             else:
-                keep(folder / f"{name}.json", outcome)
+                write_kept(folder / f"{name}.json", outcome)
                 rows += outcome
             progress.advance(bar)
     if failed:
@@ -127,7 +127,7 @@ def _episodes(tasks: list[CellTask], folder: Path, workers: int, backend: str) -
 
 
 def _read(path: Path, task: CellTask) -> list[Row]:
-    rows: list[Row] = kept(path)
+    rows: list[Row] = read_kept(path)
     whole = len(rows) == len(task.seeds) * max(1, len(task.alphas)) and all("gap_final" in row for row in rows)
     require(whole, str(path), f"{len(rows)} rows", "those of its episodes; remove it to run them again")
     return rows

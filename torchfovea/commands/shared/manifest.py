@@ -20,13 +20,13 @@ __all__ = [
     "complete",
     "config_hash",
     "finished",
-    "keep",
-    "kept",
+    "read_kept",
     "read_result",
     "record",
     "unchanged",
     "unclaimed",
     "withdraw",
+    "write_kept",
 ]
 
 MANIFEST = "manifest.json"
@@ -120,13 +120,13 @@ def unchanged(folder: Path) -> None:
         require(found == written, str(path), state, f"what was written; remove {folder / 'result.json'} to run again")
 
 
-def keep(path: Path, content: Any) -> None:
-    """Write a part of a run's work as JSON, which `kept` reads when the run goes on."""
+def write_kept(path: Path, content: Any) -> None:
+    """Write a part of a run's work as JSON, which `read_kept` reads when the run goes on."""
     write_json(path, {"sha256": _sum(json_text(content).encode()), "content": content})
 
 
-def kept(path: Path) -> Any:
-    """What `keep` wrote.
+def read_kept(path: Path) -> Any:
+    """What `write_kept` wrote.
 
     Raises:
         SettingError: for anything else, be it another digit; it names the file.
