@@ -52,7 +52,7 @@ TESTS = (
     "acquisition policies infomax metrics perception propagation remembering fuzz corners"
 ).split()
 STATES = {0: "survived", 1: "killed", 2: "killed at import", -1: "killed by time"}
-LIMIT_S = 12.0  # of the tests of one fault, by what they took undisturbed
+LIMIT_S = 6.0  # of the tests of one fault, by what they took undisturbed
 
 
 @cache
