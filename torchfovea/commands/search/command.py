@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import statistics
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ from torchfovea.commands.shared.manifest import complete, finished
 from torchfovea.commands.shared.memories import loaded_memory, memory_path
 from torchfovea.commands.shared.parallel import spread, workers_of
 from torchfovea.commands.shared.progress import progress_bar
-from torchfovea.commands.shared.rollout import batched, device_of, one_episode, roll_out, sample_of
+from torchfovea.commands.shared.rollout import batched, device_of, kept_scene, one_episode, roll_out, sample_of
 from torchfovea.commands.shared.settings import choice, number, whole
 from torchfovea.commands.shared.strategy import build_stop, build_strategy
 from torchfovea.commands.shared.viewers import Show, check_viewer, viewers
@@ -102,7 +103,7 @@ def run(cfg: DictConfig) -> float:
     write_csv(folder / "saccades.csv", SACCADE_COLUMNS, steps)
     assert last is not None
     if cfg.picture:
-        _draw(folder, cfg, observer.retina, last, rows[-1])
+        _draw(folder, cfg, observer, last, rows[-1])
     if both:
         gaze = Gaze(*(angle[-1] for angle in last.gaze))
         draw_scene(folder / "figure1.png", both, seed + episodes - 1, gaze)
@@ -236,7 +237,7 @@ def summarize(rows: list[tuple[Any, ...]]) -> dict[str, Any]:
     return figures
 
 
-def _draw(folder: Path, cfg: DictConfig, retina: Any, episode: Episode, row: tuple[Any, ...]) -> None:
+def _draw(folder: Path, cfg: DictConfig, observer: Observer, episode: Episode, row: tuple[Any, ...]) -> None:
     from torchfovea.commands.search.pictures import draw_episode
 
     moves = row[EPISODE_COLUMNS.index("saccades_to_target")]
@@ -245,7 +246,11 @@ def _draw(folder: Path, cfg: DictConfig, retina: Any, episode: Episode, row: tup
     )
     scene, sensor = cfg.scene.name.replace("_", " "), cfg.sensor.layout.replace("_", "-")
     title = f"{scene}, {sensor}, {cfg.sensor.fov_deg:g}°: {outcome}"
-    draw_episode(folder / "episode.png", episode, retina, title)
+    seen = kept_scene(cfg, observer.head, row[EPISODE_COLUMNS.index("seed")])
+    route = build_route(cfg)
+    if route is not None:
+        seen = replace(seen, pose=route.pose(episode.looks - 1))
+    draw_episode(folder / "episode.png", episode, observer.retina, title, seen)
 
 
 def _print(figures: dict[str, Any]) -> None:
