@@ -49,7 +49,7 @@ def expose(image: Tensor, noise: ImageNoise, gain: float, generator: torch.Gener
 
     The same state of the generator, on the CPU, gives the same picture.
     """
-    light = (image * gain).clamp(0, 1)
-    std = (light / noise.photons + noise.read**2).sqrt()
+    light = (image * gain).clamp_(0, 1)
+    std = (light / noise.photons).add_(noise.read**2).sqrt_()
     chance = torch.randn(image.shape, generator=generator, dtype=torch.float32).to(image)
-    return (light + std * chance).clamp(0, 1)
+    return chance.mul_(std).add_(light).clamp_(0, 1)
