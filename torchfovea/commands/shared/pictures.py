@@ -114,7 +114,8 @@ def draw_glance(glance: Glance, path: Tensor, nats: Sequence[float], retina: Ret
             axes.plot(*map(float, place), "o", mfc="none", mec="tab:orange", ms=13, mew=2.2)
     wide[2].plot(range(1, len(nats) + 1), nats, ".-", color="tab:purple")
     wide[2].set(xlabel="fixation", ylabel="mean information [nats]")
-    wide[2].xaxis.set_major_locator(MaxNLocator(integer=True))
+    wide[2].set_xlim(0.5, len(nats) + 0.5)
+    wide[2].xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     wide[2].grid(alpha=0.3)
     return figure
 

@@ -101,7 +101,8 @@ def frames(film: Path | None, page: Path | None, observer: Observer) -> Iterator
         buffer.seek(0)
         picture = Image.open(buffer).convert("RGB")
         if film is not None:
-            pictures.append(picture.quantize(colors=128))
+            # the ends of colour bars are rare and must stay what they are
+            pictures.append(picture.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE))
         if page is not None:
             still = io.BytesIO()
             picture.save(still, format="JPEG", quality=85)
