@@ -49,7 +49,7 @@ CORE = (
 )
 TESTS = (
     "gaussian unscented triangulation chart sphere egosphere memory voting encoders expected store moving reward "
-    "acquisition policies infomax metrics perception propagation remembering fuzz corners"
+    "acquisition policies infomax metrics propagation fuzz corners"
 ).split()
 STATES = {0: "survived", 1: "killed", 2: "killed at import", -1: "killed by time"}
 LIMIT_S = 6.0  # of the tests of one fault, by what they took undisturbed

@@ -163,6 +163,8 @@ def _left_alone(node: ast.AST, field: str, k: int | None, child: ast.AST) -> boo
         return True
     if isinstance(child, ast.Expr) and isinstance(child.value, ast.Constant):
         return True  # a docstring
+    if isinstance(child, ast.keyword) and child.arg == "strict":
+        return True  # of zip: a guard
     if isinstance(child, ast.Assign) and any(_text(t) in ("__all__", "Generators", "Common") for t in child.targets):
         return True
     if isinstance(child, ast.Assign) and _text(child.value).startswith(("Sequence[", "tuple[", "Tensor |")):

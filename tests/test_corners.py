@@ -18,6 +18,7 @@ from torchfovea.memory.egosphere import (
     reducible,
     trust,
 )
+from torchfovea.memory.pooling import nearness
 from torchfovea.memory.sphere import fibonacci_directions
 from torchfovea.memory.update import remember
 from torchfovea.sensing.triangulation import Observations, triangulate_rectified
@@ -31,6 +32,15 @@ def test_one_bad_direction_among_good_ones_is_refused():
     cells[3] *= 1.1
     with pytest.raises(SettingError, match="cells = directions: expected finite unit vectors"):
         empty_memory(cells, Prior())
+
+
+def test_whole_numbers_are_no_directions_of_cells():
+    """Unit vectors along the axes pass for directions; found by scripts/fuzz.sh in `resample`."""
+    axes = torch.eye(3, dtype=torch.int64)
+    with pytest.raises(SettingError, match=r"cells.dtype = torch.int64: expected a floating-point type"):
+        empty_memory(axes, Prior())
+    with pytest.raises(SettingError, match=r"cells.dtype"):
+        tf.resample(empty_memory(CELLS, Prior()), axes, Fusion())
 
 
 def test_what_is_at_the_limit_of_a_setting_is_taken():
@@ -103,6 +113,37 @@ def test_rays_that_look_back_give_finite_points():
         assert not bool(seen) and bool(torch.isfinite(point / weight).all())
 
 
+def test_supports_are_angles_for_every_camera():
+    """Half a field's width over the length of the ray of that focal length."""
+    px, sigma = torch.tensor([[0.0, 0], [40, 10], [-30, 60]]), torch.full((3,), 0.3)
+    matches = tf.Correspondences(px, px - torch.tensor([4.0, 0.0]), sigma, sigma, sigma > 0)
+    gaze, width = tf.Gaze(*(torch.tensor(v) for v in (0.0, 0.1, 0.2))), torch.tensor([1.0, 2.0, 3.0])
+    for camera in (tf.Pinhole(50.0), tf.Fisheye(50.0)):
+        seen = tf.observe(matches, tf.eyes(tf.Head(), gaze), camera, width)
+        assert torch.allclose(seen.support_rad, width / 50.0 / camera.rays(px).norm(dim=-1))
+
+
+def test_the_short_way_of_pinholes_keeps_nothing_that_looks_back():
+    """Where noise of one eye turns a ray back, that ray decides, not the other's; beside the way point by point."""
+    plain, lens = tf.Pinhole(20.0), tf.BrownConrady(20.0, 20.0, 0.0, 0.0, (0.0, 0.0, 0.0, 0.0))
+    u = torch.linspace(-120, 120, 49)
+    px = torch.stack([u, 0 * u], -1)
+    gaze = tf.Gaze(*(torch.tensor(v) for v in (0.2, 0.0, 0.5)))
+    kept = 0
+    for left, right in ((30.0, 0.1), (0.1, 30.0)):
+        sigmas = torch.full_like(u, left), torch.full_like(u, right)
+        for other in (px, px.flip(0)):
+            matches = tf.Correspondences(px, other, *sigmas, u == u)
+            for rotated in (True, False):
+                seen, expected = (
+                    tf.observe(matches, tf.eyes(tf.Head(), gaze), camera, torch.ones(49), rotated=rotated)
+                    for camera in (plain, lens)
+                )
+                assert not bool((seen.valid & ~expected.valid).any())
+                kept += int(seen.valid.sum())
+    assert kept > 20
+
+
 def test_a_class_that_is_sought_scales_the_reward():
     """Against draws of the share and of the surface, which are independent."""
     generator = torch.Generator().manual_seed(0)
@@ -129,6 +170,27 @@ def test_metrics_at_their_limits():
     expected = -math.log(4 * 9 * torch.finfo(torch.float32).eps)
     assert metrics.information(flat).item() == pytest.approx(expected, rel=1e-6)
     assert bool(torch.isfinite(reward.range_reward(Gaussian(torch.zeros(3), flat)).std))
+    quartile = torch.special.ndtri(torch.tensor([0.75], dtype=torch.float64))
+    assert metrics.coverage(quartile, (0.5,)).item() == 1
+
+
+def test_what_is_said_of_far_and_empty():
+    """The range that infinity counts as, a cell without any information, a Cartesian memory's bearing."""
+    zero = torch.zeros(1, dtype=torch.float64)
+    assert reward.range_from_inverse_range(reward.RewardBelief(zero, zero)).mean.item() == -1000
+    assert reward.inverse_range_from_range(reward.RewardBelief(zero, zero)).mean.item() == 100
+    nothing = Information(torch.zeros(1, 3, dtype=torch.float64), torch.zeros(1, 6, dtype=torch.float64))
+    rho, variance = nearness(nothing, 0.5, 4.0)
+    assert rho.item() == 0 and variance.item() == 0.25
+    assert not bool(empty_memory(CELLS, Prior(), "cartesian").bearing.any())
+
+
+def test_a_flat_mixture_is_refused():
+    """Its density would be infinite on a circle."""
+    flat = torch.diag(torch.tensor([1.0, 1.0, 0.0]))
+    for given in ({"cholesky": flat[None]}, {"covariances": flat[None]}):
+        with pytest.raises(SettingError, match="positive d"):
+            tf.direction_mixture([1.0], [[1.0, 0.0, 0.0]], **given)
 
 
 def test_evidence_of_class_enters_a_memory_that_asks_for_it():

@@ -2,6 +2,7 @@
 whole, and the restart ends as the undisturbed run did."""
 
 import csv
+import hashlib
 import json
 import os
 import random
@@ -25,6 +26,13 @@ COMMANDS = {
         "reproduce", "profile=quick", "episodes=2", "saccades=2", "workers=1", "memory.cells=120",
         "sensor.receptive_fields=200", "fig8.fov_deg=[135]", "fig8.alphas.few=[0]", "fig8.others=[pi]",
         "fig9.biases=[unbiased]", "fig9.alphas=[100]", "fig5.distances_m=[0.2,0.5]", "fig5.vergences=3",
+    ],
+    "benchmark": [
+        "benchmark", "profile=quick", "tracks=[policy]", "families=[open]", "entries=[]",
+        "mine=[{name:a,track:policy,config:['acquisition=ei']},{name:b,track:policy,config:['acquisition=pi']}]",
+    ],
+    "recording": [
+        "search", "record=true", "renderer=rays", "episodes=2", "saccades=3", "sensor.source_px=96", *TINY[2:],
     ],
 }  # fmt: skip
 # the suite wounds a few; scripts/faults.sh all of them, many times
@@ -60,7 +68,9 @@ def content(folder):
     found = {}
     for path in sorted(folder.rglob("*")):
         name = str(path.relative_to(folder))
-        if path.name == "result.json" or path.parent.name == "episodes":
+        if path.suffix == ".png" and "recording" in path.parts:
+            found[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+        elif path.name == "result.json" or path.parent.name in ("episodes", "records"):
             found[name] = timeless(json.loads(path.read_text()))
         elif path.suffix == ".csv":
             with path.open() as file:

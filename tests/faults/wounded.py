@@ -12,12 +12,18 @@ import sys
 import time
 from contextlib import suppress
 
+import torchfovea.commands.benchmark.command
 import torchfovea.commands.reproduce.command
 import torchfovea.commands.search.command
 import torchfovea.commands.tune.command
 from torchfovea.cli import main
 
-STARTED = (torchfovea.commands.reproduce.command, torchfovea.commands.search.command, torchfovea.commands.tune.command)
+STARTED = (
+    torchfovea.commands.benchmark.command,
+    torchfovea.commands.reproduce.command,
+    torchfovea.commands.search.command,
+    torchfovea.commands.tune.command,
+)
 
 
 def begin(run):
