@@ -160,6 +160,8 @@ def test_the_environment_and_a_search_take_the_same_course(action):
         "degrees_travelled": episode.degrees, "motor_seconds": episode.motor_seconds,
         "target_error_m": episode.target_error_m,
     }  # fmt: skip
+    assert episode.local_information is not None
+    expected["local_information_per_saccade"] = float(episode.local_information.mean())
     assert {name: metrics[name] for name in expected} == pytest.approx(expected, rel=1e-4)
     assert set(metrics) <= set(EPISODE_METRICS)
 
