@@ -14,10 +14,11 @@ from torchfovea.setting import SettingError
 from torchfovea.sim import volume
 from torchfovea.sim.drawing import draw_pictures, paint_scenes
 from torchfovea.sim.model import EgoPose
+from torchfovea.sim.noise import ImageNoise
 from torchfovea.sim.rays import cast, render
 from torchfovea.sim.room import CAN
 from torchfovea.sim.scene import AttentionWorld, Cans, build_scene, stand_at
-from torchfovea.sim.world import World
+from torchfovea.sim.world import World, images_together
 
 SIZE = 100
 CAMERAS = [Pinhole.from_fov(135, 100), Pinhole.from_fov(40, 100), Fisheye.from_fov(220, 100)]
@@ -110,6 +111,24 @@ def test_with_and_without_opencv(scenes, monkeypatch):
         monkeypatch.setattr(volume, "_exact", lambda exact=exact: exact)
         images.append(render(scenes[0], pose.R_left, pose.t_left, camera, 64).image)
     assert (images[0] - images[1]).abs().max() < 2e-3
+
+
+def test_worlds_that_are_drawn_together_are_drawn_as_one_by_one(scenes):
+    """In more than one batch, each with noise of its own; and one by one where one differs in kind."""
+
+    def worlds():
+        kinds = [{"noise": ImageNoise(), "seed": 3}, {}, {"noise": ImageNoise(), "seed": 4}, {}]
+        return [World(scenes[k % 2], source_px=250 if k < 3 else 64, **kind) for k, kind in enumerate(kinds)]
+
+    gazes = [Gaze(*(torch.tensor(a) for a in (0.2 * k, 0.1, 0.05))) for k in range(4)]
+    for count in (3, 4):
+        expected = [world.images(gaze) for world, gaze in zip(worlds()[:count], gazes[:count], strict=True)]
+        together = images_together(worlds()[:count], gazes[:count])
+        for pair, own in zip(together, expected, strict=True):
+            for frame, alone in zip(pair, own, strict=True):
+                assert (frame.geom == alone.geom).double().mean() > 0.9995
+                assert (frame.image - alone.image).abs().quantile(0.99) < 1e-4
+                assert (frame.range_m - alone.range_m).abs().quantile(0.99) < 1e-4
 
 
 def test_a_volume_repeats():

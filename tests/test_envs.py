@@ -64,6 +64,18 @@ def test_images_are_seen_as_a_cortical_image():
     assert again in env.observation_space and not np.array_equal(seen["retina"], again["retina"])
 
 
+def test_rows_that_are_drawn_together_see_what_one_sees():
+    settings = {"fidelity": "photometric", "overrides": (*TINY["overrides"], "sensor.source_px=60"), "saccades": 3}
+    settings |= {"observe": ("retina", "memory")}
+    together, alone = vector(2, **settings), single(**settings)
+    together.reset(seed=5)
+    alone.reset(seed=6)
+    action = np.float32([[0.1, 0.2], [-0.3, 0.1]])
+    seen, own = together.step(action)[0], alone.step(action[1])[0]
+    np.testing.assert_allclose(seen["retina"][1], own["retina"], atol=1e-3)
+    assert np.median(np.abs(seen["memory"][1] - own["memory"])) < 1e-4
+
+
 @pytest.mark.parametrize("fidelity", ["geometric", "cells"])
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_a_row_is_the_single_environment_with_its_seed(fidelity, mode):

@@ -19,6 +19,7 @@ from torchfovea.perception import Observer, perceive
 from torchfovea.search import Look, Move, Robot
 from torchfovea.sensing.head import Gaze, eyes
 from torchfovea.setting import require
+from torchfovea.sim.arena import look_together
 from torchfovea.sim.arenas import GeometricArenas
 from torchfovea.sim.model import Scene
 from torchfovea.sim.truth import truth_of
@@ -208,14 +209,16 @@ class RobotPlaces:
         self, rows: Sequence[int], memory: Memory, gaze: Gaze, generators: Generators
     ) -> tuple[Memory, Look | None]:
         """See `SearchPlaces`."""
-        robots = self._some(rows)
-        robots.expect(memory)
-        look = robots.look(gaze, generators)
+        self._some(rows).expect(memory)
+        look = self._look(rows, gaze, generators)
         return perceive(self.observer, memory, look.matches, eyes(self.observer.head, gaze)), look
+
+    def _look(self, rows: Sequence[int], gaze: Gaze, generators: Generators) -> Look:
+        return self._some(rows).look(gaze, generators)
 
 
 class PhotometricPlaces(RobotPlaces):
-    """Scenes rendered for both eyes and matched, one row after the other.
+    """Scenes rendered for both eyes of all rows together, and matched one row after the other.
 
     Args:
         cfg: of a photometric search.
@@ -236,3 +239,6 @@ class PhotometricPlaces(RobotPlaces):
             arena.noise.manual_seed(seed)
             self.robots[row] = arena
             self._truths.pop(row, None)
+
+    def _look(self, rows: Sequence[int], gaze: Gaze, generators: Generators) -> Look:
+        return look_together([self.robots[row] for row in rows], gaze, generators)

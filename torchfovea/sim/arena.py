@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -16,6 +17,7 @@ from torchfovea.perception import Observer
 from torchfovea.recordings.folder import Recorder
 from torchfovea.recordings.frames import Calibration
 from torchfovea.recordings.pictures import as_kept
+from torchfovea.rows import stack
 from torchfovea.search import Look, Move, steadied
 from torchfovea.sensing.fields import draw_fields, for_all
 from torchfovea.sensing.geometric import correspond_points, with_noise
@@ -23,12 +25,12 @@ from torchfovea.sensing.head import Gaze, eyes
 from torchfovea.setting import require
 from torchfovea.sim.truth import truth_of
 from torchfovea.sim.walk import Route
-from torchfovea.sim.world import World
+from torchfovea.sim.world import World, images_together
 from torchfovea.stereo.matchers import Match
 from torchfovea.stereo.rig import rig_at
 from torchfovea.stereo.views import verged_views
 
-__all__ = ["Pictures", "SimulatedArena"]
+__all__ = ["Pictures", "SimulatedArena", "look_together"]
 
 
 class SimulatedArena:
@@ -150,3 +152,14 @@ class SimulatedArena:
     def truth(self, cells: Tensor) -> Truth:
         """What the judge knows as the robot stands now: the nearest point, and the surface behind each cell (Nx, 3)."""
         return truth_of(self.world.scene, cells)
+
+
+def look_together(arenas: Sequence[SimulatedArena], gaze: Gaze, generators: Sequence[torch.Generator]) -> Look:
+    """Looks of photometric arenas at B gazes, as `torchfovea.arena.Arenas` has them; drawn together, not recorded."""
+    gazes = [Gaze(*(angle[b] for angle in gaze)) for b in range(len(arenas))]
+    images = images_together([a.world for a in arenas], [a._true(g) for a, g in zip(arenas, gazes, strict=True)])
+    looks = [
+        arena.match(left.image, right.image, own, generator)
+        for arena, (left, right), own, generator in zip(arenas, images, gazes, generators, strict=True)
+    ]
+    return Look(stack([look.matches for look in looks]), [look.pictures for look in looks])

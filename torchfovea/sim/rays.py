@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -165,11 +165,13 @@ def cast(scene: Scene, origin_e: Tensor, directions_e: Tensor) -> RayHits:
 _painted: weakref.WeakKeyDictionary[Any, dict[tuple[torch.device, int], Painted]] = weakref.WeakKeyDictionary()
 
 
-def _paint(scene: Scene, device: torch.device, count: int) -> Painted:
-    """A scene as tensors, so many times; wherever the robot stands, they are the same."""
-    known = _painted.setdefault(scene.model, {})
+def _paint(scenes: Sequence[Scene], device: torch.device) -> Painted:
+    """Scenes as tensors; those of one scene, so many times, are kept: wherever the robot stands, they are the same."""
+    if any(scene.model is not scenes[0].model for scene in scenes):
+        return paint_scenes(scenes, device)
+    known, count = _painted.setdefault(scenes[0].model, {}), len(scenes)
     if (device, count) not in known:
-        known[device, count] = paint_scenes([scene] * count, device)
+        known[device, count] = paint_scenes(scenes, device)
     return known[device, count]
 
 
@@ -188,16 +190,18 @@ def render(scene: Scene, R: Tensor, t: Tensor, camera: Camera, size_px: int) -> 
     """
     require(R.shape == (3, 3), "R", tuple(R.shape), "(3, 3)")
     require(t.shape == (3,), "t", tuple(t.shape), "(3,)")
-    return render_together(scene, R[None], t[None], camera, size_px)[0]
+    return render_together([scene], R[None], t[None], camera, size_px)[0]
 
 
-def render_together(scene: Scene, R: Tensor, t: Tensor, camera: Camera, size_px: int) -> list[Frame]:
-    """The pictures of `render` for K eyes, R (K, 3, 3) and t (K, 3), cheaper than one after the other."""
+def render_together(scenes: Sequence[Scene], R: Tensor, t: Tensor, camera: Camera, size_px: int) -> list[Frame]:
+    """The pictures of `render` for K eyes in as many scenes, R (K, 3, 3) and t (K, 3), cheaper than one by one."""
     require(isinstance(size_px, int) and 2 <= size_px <= 8192, "size_px", size_px, "a whole number from 2 to 8192")
-    rotation, translation = (torch.from_numpy(part).to(R.device) for part in scene.world_from_ego)
-    turn, eye = rotation @ R.detach().double(), t.detach().to(R.device).double() @ rotation.T + translation
-    drawn = draw_pictures(_paint(scene, R.device, len(R)), turn, eye, camera, size_px)
-    normal = rotation.float().T @ drawn.normal.flatten(2)
+    places = zip(*(scene.world_from_ego for scene in scenes), strict=True)
+    rotation, translation = (torch.from_numpy(np.stack(part)).to(R.device) for part in places)
+    turn = rotation @ R.detach().double()
+    eye = (rotation @ t.detach().to(R.device).double()[..., None])[..., 0] + translation
+    drawn = draw_pictures(_paint(scenes, R.device), turn, eye, camera, size_px)
+    normal = rotation.float().mT @ drawn.normal.flatten(2)
     normal = normal.view(-1, 3, size_px, size_px).permute(0, 2, 3, 1)
     range_m = drawn.range_m.clamp(max=MISS_RANGE_M)
     return [Frame(*parts) for parts in zip(drawn.image, range_m, drawn.geom, normal, strict=True)]
