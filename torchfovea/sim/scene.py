@@ -11,6 +11,7 @@ from torchfovea.sensing.head import Head
 from torchfovea.setting import require
 from torchfovea.sim.cans import Cans
 from torchfovea.sim.compile import scene_of, seeded, stand_at
+from torchfovea.sim.hidden import Hidden
 from torchfovea.sim.marked import Marked
 from torchfovea.sim.model import EgoPose, Nearest, Scene
 from torchfovea.sim.room import Room, Solid, can, furnish
@@ -19,6 +20,7 @@ __all__ = [
     "AttentionWorld",
     "Cans",
     "EgoPose",
+    "Hidden",
     "Marked",
     "Nearest",
     "Room",
