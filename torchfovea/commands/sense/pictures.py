@@ -43,13 +43,13 @@ def draw_sense(path: Path, left: Tensor, found: Any, retina: Retina | None, obse
     extent = (-0.5, width - 0.5, height - 0.5, -0.5)
     axes[0, 0].imshow(np.asarray(left[:, ::step, ::step].movedim(0, -1)).clip(0, 1), extent=extent)
     axes[0, 0].set(title="left image", xlabel="column [px]", ylabel="row [px]")
+    axes[0, 1].set(title="what the matcher found", xticks=[], yticks=[])
     if isinstance(found, Disparity | SweepRange):
         values, name = found_map(found, retina, min(*left.shape[-2:], SHOWN_PX))
         step = max(1, max(values.shape) // SHOWN_PX)
         inner = np.nanquantile(values, (0.02, 0.98)) if np.isfinite(values).any() else (0.0, 1.0)  # false matches apart
         drawn = axes[0, 1].imshow(values[::step, ::step], cmap="viridis", vmin=inner[0], vmax=inner[1])
         figure.colorbar(drawn, ax=axes[0, 1], extend="both", label=name)
-        axes[0, 1].set(title="what the matcher found", xticks=[], yticks=[])
     keep = observed.valid & (observed.mean[:, 2] > 0)
     rho, sigma = observed.mean[keep, 2], observed.cov[keep, 5].sqrt()
     maps = (
