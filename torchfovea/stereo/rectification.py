@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchfovea.gaussian import columns
 from torchfovea.sensing.camera import Camera, Pinhole
+from torchfovea.sensing.head import to_ego
 from torchfovea.sensing.retina import Retina, interpolate
 from torchfovea.setting import require
 from torchfovea.stereo.views import Views
@@ -45,7 +46,7 @@ class RectifiedPair(NamedTuple):
         if views.rectified:
             place = px * views.scale(self.retina) + px.new_tensor(views.origin_px(self.retina))
             return place, torch.ones_like(px[..., 0], dtype=torch.bool)
-        directions = views.cameras(self.retina)[0].rays(px) @ views.rig.R_left.to(px).mT
+        directions = to_ego(views.rig.R_left.to(px), views.cameras(self.retina)[0].rays(px))
         x, y, z = directions.unbind(-1)
         ahead = self.camera.in_view(directions)
         return self.camera.project(directions), ahead & (x.abs() <= self.limit * z) & (y.abs() <= self.limit * z)
@@ -63,7 +64,8 @@ class RectifiedPair(NamedTuple):
             seen = views.holds(there, retina)
         else:
             place, camera = self.place(px)[0], views.cameras(retina)[1]
-            rays = self.camera.rays(columns(place[..., 0] - shift_px, place[..., 1])) @ views.rig.R_right.to(px)
+            rays = self.camera.rays(columns(place[..., 0] - shift_px, place[..., 1]))
+            rays = to_ego(views.rig.R_right.to(px).mT, rays)
             there = camera.project(rays)
             seen = camera.in_view(rays) & views.holds(there, retina, right=True)
         return there, seen if retina is None else seen & retina.inside(there)
@@ -77,7 +79,7 @@ class RectifiedPair(NamedTuple):
             place = (px - px.new_tensor(views.origin_px(retina))) / views.scale(retina)
             return place, place, torch.ones_like(px[..., 0], dtype=torch.bool)
         rays = self.camera.rays(px)
-        turned = [rays @ R.to(like) for R in views.rig[:2]]
+        turned = [to_ego(R.to(like).mT, rays) for R in views.rig[:2]]
         left, right = (c.project(r) for c, r in zip(views.cameras(retina), turned, strict=True))
         return left, right, views.cameras(retina)[0].in_view(turned[0])
 
