@@ -74,7 +74,7 @@ def _borrowed(axes: Axes, name: str) -> bool:
 
 def _worded(axis) -> bool:
     texts = [tick.get_text() for tick in axis.get_ticklabels()]
-    return any(any(c.isalpha() for c in text) for text in texts)
+    return any(any(c.isalpha() for c in text) for text in texts if not text.startswith("$"))
 
 
 def _unit(label: str, where: str) -> list[str]:

@@ -28,6 +28,10 @@ def unnamed(axes):
     axes.set_xlabel("")
 
 
+def unnamed_logarithm(axes):
+    axes.set(yscale="log", ylim=(1e-3, 1), ylabel="")
+
+
 def without_unit(axes):
     axes.set_ylabel("range")
 
@@ -53,6 +57,7 @@ def tiny(axes):
     ("harm", "line"),
     [
         (unnamed, "x of '"),
+        (unnamed_logarithm, "y of '"),
         (without_unit, "'range' has no unit"),
         (rainbow, "colours of jet"),
         (red_and_green, "apart to some eyes"),

@@ -53,7 +53,7 @@ def draw_calibration(path: Path, data: Mapping[str, tuple[Judged, Mapping[str, T
             xlim=(0, 1), ylim=(0, 1),
         )  # fmt: skip
         histogram.set(xlabel="z = error/σ of inverse range", title=f"{kind}: {len(error)} observations", yscale="log")
-        histogram.set_ylim(1e-4, 1)
+        histogram.set(ylim=(1e-4, 1), ylabel="density")
         sparse.set(xlabel="share removed, most uncertain first", ylabel="mean |error| of the rest, relative")
         sparse.set(title="sparsification", ylim=(0, None))
         for axes in row:

@@ -167,7 +167,7 @@ def draw_propagation(
     ways = list(dict.fromkeys(way for _, way in worst))
     names = ("range variance (relative)", "covariance (whitened Frobenius/√3)", "mean [standard deviations]")
     figure = Figure(figsize=(14, 4.2 * len(charts)), layout="constrained")
-    panels = figure.subplots(len(charts), 3, squeeze=False)
+    panels = figure.subplots(len(charts), 3, squeeze=False, sharey="row")
     for row, chart in zip(panels, charts, strict=True):
         for k, axes in enumerate(row):
             for way, marker in zip(ways, "osd^v", strict=False):
