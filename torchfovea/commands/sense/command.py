@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -113,14 +114,14 @@ def _say(line: str) -> None:
 def _beside_plain(
     match: Match, pair: Pair, views: Views, retina: Retina, budget: Budget, sensed: Sensed
 ) -> dict[str, float]:
-    """Block matching of the images themselves at the same receptive fields.
+    """Block matching of the images themselves, along all directions, at the same receptive fields.
 
     Raises:
         SettingError: where it cannot match them, or only in more than a gigabyte.
     """
     ours = match if isinstance(match, Matcher) else Matcher(SGBM())
     params = ours.params if isinstance(ours.params, SGBM) else SGBM()
-    _, plain = match_sgbm(views, None, params, budget, ours.nearest_m, most_bytes=PLAIN_BYTES)
+    _, plain = match_sgbm(views, None, replace(params, mode="hh"), budget, ours.nearest_m, most_bytes=PLAIN_BYTES)
     again = read_at_fields(plain.disparity, views, retina, plain.valid)
     return beside(pair, views, retina, sensed.observed, sensed.points, again)
 
