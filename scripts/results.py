@@ -110,8 +110,11 @@ def _machine() -> str:
 
 def origin(runs: Sequence[Run]) -> str:
     """Where a table comes from, in a paragraph."""
-    where = " and ".join(dict.fromkeys(f"at {run.commit} on {run.machine}" for run in runs))
-    return f"*{'; '.join(f'`{run.command}`' for run in runs)}: {where}.*"
+    commits, machines = (
+        dict.fromkeys(parts) for parts in ([run.commit for run in runs], [run.machine for run in runs])
+    )
+    said = "; ".join(f"`{run.command}`" for run in runs)
+    return f"*{said}: at {', '.join(commits)} on {' and '.join(machines)}.*"
 
 
 def markdown(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -231,15 +234,10 @@ FUSION = {
     "sensor": "sensor", "saccades": "looks", "fusion": "fusion", "range_ratio_median": "estimated/true range",
     "nees_mean": "range NEES", "z2_median": "median z²", "outlier_share": "outliers",
 }  # fmt: skip
-BENCH = {
-    "path": "path", "work": "work", "median_ms": "ms", "peer": "beside", "peer_median_ms": "its ms", "ratio": "ratio",
-}  # fmt: skip
-
 TABLES: dict[str, Callable[[Sequence[Run]], str]] = {
     "pair": pair,
     "search": search,
     "fusion": rows_of("fusion", FUSION, short),
-    "bench": rows_of("bench", BENCH, short),
     "claims": claims,
 }
 

@@ -26,7 +26,6 @@ FUSION = """sensor,fusion,saccades,range_ratio_median,nees_mean,z2_median,outlie
 log_polar,"inverse_range, a cell a point",5,1.0001,1.2638,0.5728,0.0276
 uniform,printed,20,0.935,11.6,18.94,0.38
 """
-BENCH = "path,work,median_ms,peer,peer_median_ms,ratio\nstep,40000 RFs,23.456,NumPy,150.1,6.4\nfill,,7,,,\n"
 CLAIM = {
     "section": "7.2", "text": "A fovea helps", "verdict": "holds", "estimate": 8.4, "ci_low": 6.2, "ci_high": 10.1,
     "n": 20,
@@ -65,11 +64,6 @@ def run_of(folder, command, words, result, **tables):
                 "| log-polar | 5 | inverse range, a cell a point | 1.00 | 1.26 | 0.573 | 2.8% |",
                 "| uniform | 20 | printed | 0.935 | 11.6 | 18.9 | 38.0% |",
             ],
-        ),
-        (
-            "bench",
-            ("bench", ["profile=quick"], {}, {"bench": BENCH}),
-            ["| step | 40000 RFs | 23.5 | NumPy | 150 | 6.40 |", "| fill | – | 7 | – | – | – |"],
         ),
         (
             "claims",
