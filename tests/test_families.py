@@ -70,7 +70,7 @@ def test_a_noisy_floor_is_no_object():
     assert share[0.0] > 0.15 and share[3.0] < 0.01
 
 
-@pytest.mark.parametrize("name", ["small", "far"])
+@pytest.mark.parametrize("name", ["small", "far", "narrow", "told"])
 def test_a_family_has_a_distribution_to_tune_on(name):
     with initialize_config_dir(conf_dir(), version_base="1.3"):
         cfg = compose("tune", overrides=[f"distribution={name}", "head=human"])
