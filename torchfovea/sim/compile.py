@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +16,7 @@ from torchfovea.sim.model import EgoPose, Scene
 from torchfovea.sim.room import Solid, build_spec, paint_solids
 from torchfovea.sim.truth import find_nearest
 
-__all__ = ["compile_solids", "scene_of", "seeded", "stand_at"]
+__all__ = ["compile_solids", "displaced", "scene_of", "seeded", "stand_at"]
 
 
 def seeded(seed: int) -> np.random.Generator:
@@ -64,3 +64,29 @@ def stand_at(scene: Scene, pose: EgoPose) -> Scene:
         require(math.isfinite(value), f"pose.{name}", value, "a finite number")
     moved = replace(scene, pose=pose)
     return replace(moved, nearest=find_nearest(moved))
+
+
+def displaced(scene: Scene, names: Collection[str], shift_m: tuple[float, float, float]) -> Scene:
+    """The same scene after somebody has moved things, their textures with them; its truth is found anew.
+
+    Args:
+        scene: before.
+        names: of the solids that are moved; what is moved far below the floor is gone.
+        shift_m: by how much, in the world.
+    """
+    known = [solid.name for solid in scene.solids]
+    for name in names:
+        require(name in known, "names", name, "a solid of the scene")
+    solids = []
+    offset, centre = scene.paint.offset.clone(), scene.paint.centre.clone()
+    for geom, solid in enumerate(scene.solids):
+        if solid.name in names:
+            x, y, z = (float(a + b) for a, b in zip(solid.position_m, shift_m, strict=True))
+            solid = replace(solid, position_m=(x, y, z))
+            shift = torch.tensor(shift_m, dtype=offset.dtype)
+            offset[:, geom] -= shift
+            centre[:, geom] += shift
+        solids.append(solid)
+    after = compile_solids(solids, scene.head, np.random.default_rng(0), scene.params, scene.seed)
+    paint = scene.paint._replace(offset=offset, centre=centre)
+    return stand_at(replace(after, paint=paint, marks=scene.marks), scene.pose)
