@@ -318,7 +318,17 @@ def table(out: Path) -> str:
         )
         total += count
         rows.append(_row(module, count))
-    return "\n".join([*rows, _row("all", total)])
+    every = sum(len(mutants_of(module, source_of(module)[1])) for module in CORE)
+    low, high = interval(total["killed"], total["killed"] + total["survived"])
+    said = f"{sum(total.values())} of {every} faults tried; killed of all that differ: {low:.1%} to {high:.1%} with 95%"
+    return "\n".join([*rows, _row("all", total), "", said])
+
+
+def interval(some: int, of: int, z: float = 1.96) -> tuple[float, float]:
+    """Wilson's interval of a share."""
+    share, n = some / max(1, of), max(1, of)
+    middle, half = share + z * z / (2 * n), z * (share * (1 - share) / n + z * z / (4 * n * n)) ** 0.5
+    return (middle - half) / (1 + z * z / n), (middle + half) / (1 + z * z / n)
 
 
 def _row(name: str, count: Counter[str]) -> str:

@@ -8,20 +8,24 @@ import torch
 import torchfovea as tf
 from torchfovea import metrics
 from torchfovea.deciding import reward
-from torchfovea.gaussian import Gaussian, Information, columns
+from torchfovea.deciding.acquisition import best_of
+from torchfovea.gaussian import Gaussian, Information, columns, positive_definite
 from torchfovea.memory.egosphere import (
     Fusion,
     Prior,
     cartesian_from_patches,
     empty_memory,
     inverse_range_belief,
+    prior_information,
     reducible,
     trust,
 )
-from torchfovea.memory.pooling import nearness
+from torchfovea.memory.pooling import Pooled, found_points, nearness, share_errors
 from torchfovea.memory.sphere import fibonacci_directions
 from torchfovea.memory.update import remember
+from torchfovea.sensing.kinship import Kinship
 from torchfovea.sensing.triangulation import Observations, triangulate_rectified
+from torchfovea.sensing.unscented import SigmaPoints, sigma_root
 from torchfovea.setting import SettingError
 
 CELLS = fibonacci_directions(12, torch.float64)
@@ -159,7 +163,7 @@ def test_a_class_that_is_sought_scales_the_reward():
 def test_metrics_at_their_limits():
     """Exact numbers, so that a limit that belongs to the other side would show."""
     number = torch.tensor
-    assert metrics.phantom(number([1.0, 1.0]), number([2.0, math.inf]), 0.5).tolist() == [False, True]
+    assert metrics.phantom(number([0.5, 0.5]), number([1.0, math.inf]), 1.0).tolist() == [False, True]
     points, target = torch.tensor([[0.5, 0, 0], [0.25, 0, 0]]), torch.zeros(3)
     assert metrics.near_target(points, target, 0.5).tolist() == [False, True]
     assert metrics.nees_mean(number([2.0])).item() == 4 and metrics.outlier_share(number([2.0])).item() == 0
@@ -183,6 +187,10 @@ def test_what_is_said_of_far_and_empty():
     rho, variance = nearness(nothing, 0.5, 4.0)
     assert rho.item() == 0 and variance.item() == 0.25
     assert not bool(empty_memory(CELLS, Prior(), "cartesian").bearing.any())
+    none = torch.zeros(12, dtype=torch.float64)
+    blank = Pooled(Information(none[:, None].expand(12, 3), none[:, None].expand(12, 6)), none, none)
+    for chart in ("inverse_range", "cartesian"):
+        assert torch.allclose(found_points(blank, CELLS, chart, 1.5), CELLS)
 
 
 def test_a_flat_mixture_is_refused():
@@ -213,3 +221,95 @@ def test_evidence_of_class_enters_a_memory_that_asks_for_it():
     expected = torch.full((12,), 0.5, dtype=torch.float64)
     expected[[2, 7]] = torch.tensor([1.0, 0.2], dtype=torch.float64) / 1.2
     assert torch.allclose(shares, expected)
+
+
+def test_directions_of_any_length_have_a_density():
+    mixture = tf.direction_mixture([1.0], [[1.0, 0.0, 0.0]], [[0.1, 0.2, 0.3]], dtype=torch.float64)
+    for length in (1e-200, 1e-100, 1e100, 1e200):
+        assert torch.allclose(tf.log_density(mixture, length * CELLS), tf.log_density(mixture, CELLS))
+
+
+def test_of_one_look_what_lasts_is_known_twice():
+    """√l/u and l/u² of a single look: the second is the square of the first."""
+    seen = CELLS[[2, 7]]
+    cov = torch.tensor([1e-4, 0, 0, 1e-4, 0, 4e-4], dtype=torch.float64).expand(2, 6)
+    mean = torch.tensor([[0.0, 0, 2], [0, 0, 3]], dtype=torch.float64)
+    valid = torch.tensor([True, True])
+    one = Observations(mean, cov, seen, torch.full((2,), 1e-3, dtype=torch.float64), valid)
+    patch = torch.full((2,), 0.04, dtype=torch.float64)
+    memory = remember(empty_memory(CELLS, Prior()), one, Fusion(), kin=Kinship(patch, 0.5, 0 * patch + 0.3))
+    once, twice = memory.lasting.unbind(-1)
+    variance = 4e-4 + 1.5**2 * 2e-4  # an error of bearing on a slope is one of inverse range
+    assert once[[2, 7]].tolist() == pytest.approx([(0.3 / 1.04 / variance) ** 0.5] * 2)
+    assert memory.bearing[[2, 7]].tolist() == pytest.approx([0.1**-2 + 1e4] * 2)
+    assert bool((once[[2, 7]] > 0).all()) and torch.allclose(twice, once.square()) and int((once > 0).sum()) == 2
+
+
+def test_points_at_one_standard_deviation_are_far_enough_out():
+    assert SigmaPoints(4, 1.0, 0.0, -3.0).by_axis and SigmaPoints(4, 1.0, 0.0, -3.0).spread == 1
+
+
+def test_what_an_unseen_cell_believes():
+    """The prior's own numbers, each by itself."""
+    prior = Prior(0.7, 0.3, 0.2, 1.1)
+    information, bearing = prior_information(CELLS, prior)
+    expected = torch.tensor([1.1**-2, 0, 0, 1.1**-2, 0, 0.3**-2], dtype=torch.float64)
+    assert torch.allclose(information.matrix.double(), expected)
+    assert torch.allclose(information.vector.double(), torch.tensor([0, 0, 0.7 / 0.09], dtype=torch.float64))
+    assert torch.allclose(bearing.double(), torch.tensor(25.0, dtype=torch.float64))
+    information, bearing = prior_information(CELLS, prior, "cartesian")
+    assert torch.allclose(information.vector.double(), 0.7 / 0.09 * CELLS) and not bool(bearing.any())
+
+
+def test_errors_in_common_of_looks_that_tell_little():
+    """(1 − c)/Λ + c s²/Λ² with Λ below 1, of fields that see a cell straight ahead."""
+    number = torch.tensor([1.0], dtype=torch.float64)
+    total, root, patches, shared = 0.5 * number, 0.9 * number, 2.0 * number, 0.6
+    matrix = columns(0 * number, 0 * number, 0 * number, 0 * number, 0 * number, total)
+    pooled = Pooled(Information(columns(0 * number, 0 * number, 0.3 * total), matrix), number, 2 * number)
+    found, lasting = share_errors(pooled, columns(total, root, 0.4 * number), patches, shared)
+    c = shared / 3
+    assert 1 / found.information.matrix[0, 5].item() == pytest.approx((1 - c) / 0.5 + c * 0.9**2 / 0.5**2)
+    assert lasting.item() == pytest.approx((0.4 / 0.5) ** 2 / 3)
+
+
+def test_rays_that_meet_behind_one_eye():
+    left, right = torch.tensor([-0.1, 0.0, 0.0]), torch.tensor([0.1, 0.0, 0.0])
+    place = torch.tensor([0.3, 0.0, 0.4])
+    for sign_left, sign_right in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        _, seen = tf.triangulate(sign_left * (place - left), sign_right * (place - right), left, right)
+        assert bool(seen) == (sign_left > 0 < sign_right)
+
+
+def test_small_covariances_are_as_symmetric_as_large_ones():
+    for size in (1e-4, 1.0, 1e4):
+        cov = size * (torch.eye(3, dtype=torch.float64) + 0.1)
+        tf.direction_mixture([1.0], [[1.0, 0.0, 0.0]], cov[None])
+        cov[0, 1] *= 1.01
+        with pytest.raises(SettingError, match="symmetric positive definite"):
+            tf.direction_mixture([1.0], [[1.0, 0.0, 0.0]], cov[None])
+    mean = torch.tensor([[1.0, 0.0, 0.0]])
+    assert tf.direction_mixture([1.0], mean, [[0.1, 0.2, 0.3]], dtype=torch.float64).means.dtype == torch.float64
+
+
+def test_roots_are_rotated_unless_told_otherwise():
+    left, right = torch.tensor([0.3, 0.5]), torch.tensor([0.4, 0.2])
+    assert torch.equal(sigma_root(left, right), sigma_root(left, right, True))
+    assert not torch.equal(sigma_root(left, right), sigma_root(left, right, False))
+
+
+def test_metrics_of_any_batch():
+    hit = torch.zeros(2, 3, 4, dtype=torch.bool)
+    hit[1, 2, 3] = True
+    assert metrics.found(hit).tolist() == [[False] * 3, [False, False, True]]
+    assert metrics.saccades_to_target(hit).tolist() == [[4] * 3, [4, 4, 3]]
+
+
+def test_one_row_alone_has_an_incumbent():
+    assert best_of(torch.tensor([3.0, 5, 7]), torch.tensor([True, True, False])).item() == 5
+    assert best_of(torch.tensor([3.0, 5, 7]), torch.tensor([False] * 3)).item() == 3
+
+
+def test_what_float32_could_not_invert_is_not_definite():
+    thin = torch.tensor([1.0, 1 - 1.2e-7, 0, 1, 0, 1], dtype=torch.float64)
+    assert bool(positive_definite(thin)) and not bool(positive_definite(thin.float()))
