@@ -196,6 +196,8 @@ def test_what_is_said_of_far_and_empty():
 def test_a_flat_mixture_is_refused():
     """Its density would be infinite on a circle."""
     flat = torch.diag(torch.tensor([1.0, 1.0, 0.0]))
+    with pytest.raises(SettingError, match=r"means = \(0, 3\)"):
+        tf.direction_mixture([], torch.zeros(0, 3), torch.zeros(0, 3, 3))
     for given in ({"cholesky": flat[None]}, {"covariances": flat[None]}):
         with pytest.raises(SettingError, match="positive d"):
             tf.direction_mixture([1.0], [[1.0, 0.0, 0.0]], **given)
@@ -313,3 +315,16 @@ def test_one_row_alone_has_an_incumbent():
 def test_what_float32_could_not_invert_is_not_definite():
     thin = torch.tensor([1.0, 1 - 1.2e-7, 0, 1, 0, 1], dtype=torch.float64)
     assert bool(positive_definite(thin)) and not bool(positive_definite(thin.float()))
+
+
+def test_the_midpoint_method_is_integrated_to_fourth_order():
+    """The inverse of disparity D where rays miss each other by v: variance e²(1 + 4e²), as its docstring derives."""
+    error = 0.05
+    root = error * torch.eye(4, dtype=torch.float64)
+
+    def inverse(x):
+        return (x[..., :1] / (x[..., :1] ** 2 + x[..., 1:2] ** 2)).clone()
+
+    mean = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
+    _, variance, _ = tf.unscented_transform(inverse, mean, root, SigmaPoints.midpoint())
+    assert variance.item() == pytest.approx(error**2 * (1 + 4 * error**2), rel=1e-3)
