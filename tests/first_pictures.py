@@ -102,7 +102,7 @@ def _label(local, size, footprint, base):
 
 
 def _colour(paint, geom, point_w, normal_w, footprint_m):
-    look, offset, centre, can = (part.T.numpy() for part in paint)
+    look, offset, centre, can = (part.T.numpy() for part in paint[:4])
     solid = point_w + offset[geom]
     spread = (np.float32(_PIXEL_SIGMA) * footprint_m) ** 2
     look = look[geom]

@@ -16,8 +16,9 @@ from torchfovea.sim.drawing import draw_pictures, paint_scenes
 from torchfovea.sim.model import EgoPose
 from torchfovea.sim.noise import ImageNoise
 from torchfovea.sim.rays import cast, render
-from torchfovea.sim.room import CAN
+from torchfovea.sim.room import CAN, Room
 from torchfovea.sim.scene import AttentionWorld, Cans, build_scene, stand_at
+from torchfovea.sim.texture import colour
 from torchfovea.sim.world import World, images_together
 
 SIZE = 100
@@ -51,6 +52,30 @@ def test_the_picture_that_rays_draw(scenes, camera, gaze):
         error = (frame.image - image).abs().amax(0)[same]
         # a two hundredth of white where a texture is cut off, nothing elsewhere
         assert error.median() < 1e-4 and error.quantile(0.99) < 3e-3 and error.max() < 0.015
+
+
+def test_wallpaper_repeats_and_plain_walls_are_plain():
+    """The texture of the same wall, at places that its period is apart, and elsewhere."""
+    generator = torch.Generator().manual_seed(0)
+    walls, far = torch.rand(3, 20, 30, generator=generator) * 2 - 1, torch.full((20, 30), 1e-3)
+    geom, normal = (
+        torch.zeros(20, 30, dtype=torch.int64),
+        (torch.zeros(20, 30), torch.zeros(20, 30), torch.ones(20, 30)),
+    )
+
+    def painted(room, shift_m):
+        paint = build_scene(Cans(room=room), 5).paint
+        return colour(paint, geom, tuple(walls + shift_m), normal, far)
+
+    for room, same in ((Room(), False), (Room(repeat_m=0.25), True)):
+        here = painted(room, 0.0)
+        for shift_m in (0.25, -0.75):
+            off = (painted(room, shift_m) - here).abs()
+            # places within rounding of a seam may lie on either side of it
+            assert (off < 1e-3).double().mean() > 0.99 if same else off.median() > 0.02
+        assert (painted(room, 0.1) - here).abs().median() > 0.02
+    spread = [float(painted(Room(contrast=c), 0.0).log().std()) for c in (1.0, 0.1)]
+    assert spread[1] < 0.6 * spread[0]
 
 
 def test_along_the_axes(scenes):

@@ -202,6 +202,8 @@ def test_an_empty_reach_is_no_nan():
         (lambda: AttentionWorld(can_radius_m=0.2), "scene.can_radius_m"),
         (lambda: AttentionWorld(can_height_m=0.0), "scene.can_height_m"),
         (lambda: AttentionWorld(room=Room(front_m=1.5, furniture=False)), "room.front_m"),
+        (lambda: Room(contrast=-0.1), "room.contrast = -0.1"),
+        (lambda: Room(repeat_m=0.0), "room.repeat_m = 0.0"),
         (lambda: Room(height_m=0.5), "room.height_m"),
         (lambda: Room(side_m=1.5), "room.side_m"),
         (lambda: build_scene(Cans(), -1), "seed"),

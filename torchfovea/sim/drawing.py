@@ -94,8 +94,8 @@ def paint_scenes(scenes: Sequence[Scene], device: torch.device | str = "cpu") ->
     geom = torch.cat([solids.faces.T, *(group.geom for _, group in solids.groups)], 1)
     tables = []
     for scene, own in zip(scenes, geom.cpu().clamp(min=0), strict=True):
-        tables.append(Paint(*(part[:, own] for part in scene.paint)))
-    paint = Paint(*(torch.cat(parts, 1).to(device) for parts in zip(*tables, strict=True)))
+        tables.append(Paint(*(part[..., own] for part in scene.paint)))
+    paint = Paint(*(torch.cat(parts, -1).to(device) for parts in zip(*tables, strict=True)))
     return Painted(solids, geom.reshape(-1), paint)
 
 

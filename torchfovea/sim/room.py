@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -70,6 +70,7 @@ class Solid:
     accent: tuple[float, float, float] = (0.5, 0.5, 0.5)
     contrast: float = 1.0
     label: bool = field(default=False)
+    repeat_m: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,8 @@ class Room:
         side_m: to the walls on either side, > 0.
         height_m: of the ceiling, > 0.
         furniture: whether large objects stand along the walls.
+        contrast: of the texture of the room and its furniture, in shares of the usual; 0 to 2.
+        repeat_m: after which that texture repeats along each axis of the world; inf: never.
     """
 
     front_m: float = 4.0
@@ -89,6 +92,8 @@ class Room:
     side_m: float = 3.2
     height_m: float = 2.8
     furniture: bool = True
+    contrast: float = 1.0
+    repeat_m: float = math.inf
 
     def __post_init__(self) -> None:
         """Raise SettingError for a room without room."""
@@ -96,6 +101,8 @@ class Room:
             value = getattr(self, name)
             least = _FURNISHED[name] if self.furniture else 1.0
             require(least <= value <= 50.0, f"room.{name}", value, f"{least} to 50 metres")
+        require(0 <= self.contrast <= 2, "room.contrast", self.contrast, "0 to 2, in shares of the usual")
+        require(self.repeat_m >= 0.02, "room.repeat_m", self.repeat_m, "at least 0.02 m, or inf")
 
 
 def can(
@@ -145,7 +152,7 @@ def furnish(room: Room, rng: np.random.Generator) -> list[Solid]:
         for i, ((shape, (x, y), extent, yaw), k) in enumerate(zip(pieces, order, strict=True)):
             place = (x, y, extent[-1])
             solids.append(Solid(f"furniture_{i}", FURNITURE, shape, place, extent, yaw, *_FURNITURE[k]))
-    return solids
+    return [replace(solid, contrast=room.contrast, repeat_m=room.repeat_m) for solid in solids]
 
 
 def pole(name: str, x: float, y: float, top_m: float, radius_m: float) -> Solid:
@@ -197,4 +204,5 @@ def paint_solids(solids: Sequence[Solid], rng: np.random.Generator) -> Paint:
         offset=columns(rng.uniform(0, 20, (len(solids), 3)).tolist()),
         centre=columns(s.position_m for s in solids),
         can=columns(s.size_m[:2] if s.label else (0.0, 0.0) for s in solids),
+        repeat_m=torch.tensor([s.repeat_m for s in solids], dtype=torch.float32),
     )

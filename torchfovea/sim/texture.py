@@ -42,12 +42,14 @@ class Paint(NamedTuple):
         offset: (3, G), its place in the noise, added to world coordinates [m].
         centre: (3, G), in the world [m].
         can: (2, G), radius and half height of an upright can's label [m]; 0 for everything else.
+        repeat_m: (G,), after which the noise repeats along each axis of the world; inf: never.
     """
 
     look: Tensor
     offset: Tensor
     centre: Tensor
     can: Tensor
+    repeat_m: Tensor
 
 
 @lru_cache(maxsize=4)
@@ -174,7 +176,12 @@ def colour(paint: Paint, geom: Tensor, point: Components, normal: Components, fo
     def told(table: Tensor) -> Tensor:  # (G,) of each point
         return table.index_select(0, which).view_as(geom)
 
-    solid = torch.stack([told(table).add_(part) for table, part in zip(paint.offset, point, strict=True)])
+    places = point
+    if bool(paint.repeat_m.isfinite().any()):
+        repeat = told(paint.repeat_m)
+        x, y, z = (torch.where(repeat.isfinite(), part.remainder(repeat), part) for part in point)
+        places = x, y, z
+    solid = torch.stack([told(table).add_(part) for table, part in zip(paint.offset, places, strict=True)])
     log_albedo, power, tint = _log_albedo(solid, (_PIXEL_SIGMA * footprint_m).square_())
     mix = tint.mul_(3).sigmoid_().mul_(0.65)
     albedo = torch.stack([torch.lerp(told(paint.look[k]), told(paint.look[3 + k]), mix) for k in range(3)])
