@@ -167,6 +167,7 @@ def _job(command: str, overrides: list[str], full_error: bool) -> Callable[[Any]
         from omegaconf import OmegaConf
 
         from torchfovea.commands.shared.config import run_folder
+        from torchfovea.commands.shared.kinds import check_groups, check_kinds
         from torchfovea.commands.shared.manifest import MANIFEST, record, unclaimed, withdraw
         from torchfovea.commands.shared.mistakes import describe, need
         from torchfovea.commands.shared.opening import to_open
@@ -177,6 +178,8 @@ def _job(command: str, overrides: list[str], full_error: bool) -> Callable[[Any]
         sweeping = not OmegaConf.is_missing(settings, "num")
         try:
             check_said(cfg)
+            check_groups(command)
+            check_kinds(cfg, command)
             if not COMMANDS[command].resumes:
                 unclaimed(folder)
             taken = COMMANDS[command].resumes and (folder / "result.json").exists()

@@ -16,7 +16,8 @@ from torchfovea.commands.bench.paths import paths_of_look
 from torchfovea.commands.bench.retina_paths import path_of_retina
 from torchfovea.commands.bench.steps import batched_steps, paths_of_steps
 from torchfovea.commands.bench.timing import Path
-from torchfovea.commands.shared.build import build_cells, build_observer, whole
+from torchfovea.commands.shared.build import build_cells, build_observer, choice, whole
+from torchfovea.commands.shared.rehearsal import rehearse
 from torchfovea.commands.shared.settings import construct
 from torchfovea.perception import Observer
 from torchfovea.sensing.layout import LogPolar
@@ -36,7 +37,7 @@ def builders_of(cfg: DictConfig, device: str, wanted: Sequence[str]) -> list[Cal
         wanted: some of `PATHS`; builders of several may make others too.
 
     Raises:
-        SettingError: for an observer that the peers are not written for.
+        SettingError: for an observer that the peers are not written for, and whatever a path would refuse.
     """
     full = build_observer(cfg)
     full, mode = dataclasses.replace(full, compile="off"), full.compile
@@ -53,6 +54,12 @@ def builders_of(cfg: DictConfig, device: str, wanted: Sequence[str]) -> list[Cal
     small = dataclasses.replace(plain, retina=construct(LogPolar, fewer, "sensor"))
     few = OmegaConf.merge(cfg, {"memory": {"cells": whole(cfg, "small.cells")}})
     assert isinstance(few, DictConfig)
+    images = OmegaConf.merge(cfg, {"fidelity": "photometric"})
+    assert isinstance(images, DictConfig)
+    whole(cfg, "saccades", 2), whole(cfg, "tuning.episodes", 8), whole(cfg, "tuning.cells", 2)
+    choice(cfg, "fidelity", ("geometric", "photometric"))
+    rehearse(images, full.head, full)
+    require(full.classes is None, "reward", "of_class", "a reward of nearness, in bench")
 
     def cells_of(settings: DictConfig) -> torch.Tensor:
         return build_cells(settings, head, torch.Generator().manual_seed(int(cfg.seed)))

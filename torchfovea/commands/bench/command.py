@@ -58,6 +58,7 @@ def _run(cfg: DictConfig) -> float | None:
     wanted = PATHS if cfg.paths is None else cfg.paths if OmegaConf.is_list(cfg.paths) else (cfg.paths,)
     for name in wanted:
         require(name in PATHS, "paths", name, "some of " + ", ".join(PATHS))
+    builders = builders_of(cfg, device, wanted)
     if cfg.against is not None:
         return compare(cfg, wanted, seconds)
     require(cfg.history is None, "history", cfg.history, "null, or against=COMMIT besides")
@@ -88,7 +89,7 @@ def _run(cfg: DictConfig) -> float | None:
     )
     rows: list[list[Any]] = []
     done: set[str] = set()
-    for builder in builders_of(cfg, device, wanted):
+    for builder in builders:
         for path in builder():
             if path.name not in wanted:
                 continue

@@ -40,12 +40,11 @@ Outcome = dict[str, Any]
 
 def run(cfg: DictConfig) -> float:
     """Run what is missing in the folder, and draw the leaderboard; the number of whole records is the score."""
-    folder = run_folder()
     if cfg.report is not None:
         sources = [str(path) for path in ([cfg.report] if isinstance(cfg.report, str) else cfg.report)]
-        records = read_records([Path(source).expanduser() for source in sources])
+        records, folder = read_records([Path(source).expanduser() for source in sources]), run_folder()
     else:
-        records = _records(cfg, folder)
+        records, folder = _records(cfg)
     leaderboard(folder, records)
     whole = sum(not record["errors"] for record in records)
     write_result(folder, {"entries": len(records), "complete": whole, "failed": len(records) - whole})
@@ -53,25 +52,26 @@ def run(cfg: DictConfig) -> float:
     return float(whole)
 
 
-def _records(cfg: DictConfig, folder: Path) -> list[dict[str, Any]]:
-    """The record of every entry, written to the folder."""
+def _records(cfg: DictConfig) -> tuple[list[dict[str, Any]], Path]:
+    """The record of every entry, and the run's folder, to which they are written."""
     profile = choice(cfg, "size", tuple(SIZES))
     size, split = SIZES[profile], choice(cfg, "split", ("training", "validation", "test"))
     tracks = list(cfg.tracks) if OmegaConf.is_list(cfg.tracks) else [cfg.tracks]
     require(len(tracks) > 0 and set(tracks) <= set(TRACKS), "tracks", tracks, "some of " + ", ".join(TRACKS))
-    limit_s, entries = number(cfg, "limit_s"), entries_of(cfg, tracks)
+    limit_s, entries, workers = number(cfg, "limit_s"), entries_of(cfg, tracks), workers_of(cfg)
     size = size._replace(families=_families(cfg, size))
     units = [unit for entry in entries for unit in _units(entry, size, split, limit_s)]
     marks = fingerprint(size.families)
     told = [_told(unit, marks) for unit in units]
-    outcomes = _outcomes(units, told, folder / "units", *workers_of(cfg))
+    folder = run_folder()
+    outcomes = _outcomes(units, told, folder / "units", *workers)
     records = []
     for entry in entries:
         own = [(unit, outcome) for unit, outcome in zip(units, outcomes, strict=True) if unit.entry == entry]
         record = _record(entry, own, profile, split, marks)
         write_json(folder / "records" / f"{entry.track}.{_file_name(entry.name)}.json", record)
         records.append(record)
-    return records
+    return records, folder
 
 
 def _families(cfg: DictConfig, size: Size) -> tuple[str, ...]:

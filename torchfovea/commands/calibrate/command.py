@@ -13,13 +13,14 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from torchfovea.commands.calibrate.report import bins, print_figures, regions_of, table
-from torchfovea.commands.calibrate.simulated import SceneTask, looks_at_scenes
+from torchfovea.commands.calibrate.simulated import SceneTask, looks_at_scenes, viewed
 from torchfovea.commands.calibrate.truths import Truths, look_at_pair
 from torchfovea.commands.shared.budgets import build_budget, made_for, write_budget
-from torchfovea.commands.shared.build import build_matcher, build_sensor, construct, whole
+from torchfovea.commands.shared.build import build_head, build_matcher, build_sensor, construct, whole
 from torchfovea.commands.shared.config import run_folder, sized
-from torchfovea.commands.shared.pairs import gaze_of, load_pair, named_pair
+from torchfovea.commands.shared.pairs import OWN, Pair, check_named, gaze_of, load_pair, named_pair
 from torchfovea.commands.shared.parallel import workers_of
+from torchfovea.commands.shared.rehearsal import rehearse
 from torchfovea.commands.shared.unread import refuse_unread
 from torchfovea.files import write_csv, write_result
 from torchfovea.sensing.correspondence import Budget
@@ -62,22 +63,33 @@ class Split(NamedTuple):
 def run(cfg: DictConfig) -> float:
     """Calibrate; the mixture's negative log-likelihood of what was judged on is what a sweeper sees."""
     refuse_unread("sensor.sample")
+    if cfg.real is False:
+        refuse_unread("pair", *OWN, "gaze_px", only="with real=true")
     cfg = sized(cfg, QUICK, FULL)
     scenes, judged_scenes = whole(cfg, "scenes", 0), whole(cfg, "judged_scenes")
     whole(cfg, "looks"), whole(cfg, "seed", 0), workers_of(cfg)
     require(isinstance(cfg.real, bool), "real", cfg.real, "true or false")
     require(OmegaConf.is_list(cfg.pairs), "pairs", cfg.pairs, "a list of motorcycle and folders")
     require(scenes > 0 or cfg.real or len(cfg.pairs) > 0, "scenes", scenes, "at least 1, real=true or pairs")
+    build_sensor(cfg)
     budget = build_budget(cfg)
     start = replace(budget, source_px=whole(cfg, "sensor.source_px", 16))
-    matcher, folder = build_matcher(cfg), run_folder()
+    matcher = build_matcher(cfg)
     likelihood = construct(Likelihood, cfg.fit, "fit")
     edges = _edges(cfg, "range_edges_m"), _edges(cfg, "eccentricity_edges_deg")
     angles = _edges(cfg, "fovs_deg", least=1) if len(cfg.fovs_deg) else [float(cfg.sensor.fov_deg)]
-    data: dict[str, Split] = {}
+    for fov_deg in angles:
+        build_sensor(viewed(cfg, fov_deg))
+    rehearse(cfg, build_head(cfg))
+    for k, name in enumerate(cfg.pairs):
+        check_named(name, f"pairs[{k}]")
+    real = load_pair(cfg) if cfg.real else None
+    gaze = None if real is None else gaze_of(cfg, real)
+    folder = run_folder()
+    # the files first: they can be broken, and are soon looked at
+    data = _pairs(cfg, start, matcher, real, gaze)
     if scenes:
-        data["simulated"] = _simulate(cfg, start, scenes, judged_scenes, angles)
-    data |= _pairs(cfg, start, matcher)
+        data = {"simulated": _simulate(cfg, start, scenes, judged_scenes, angles), **data}
     rank = _agreement(matcher, data)
 
     def fit(*without: str) -> BudgetFit:
@@ -137,8 +149,10 @@ def _simulate(cfg: DictConfig, budget: Budget, scenes: int, judged_scenes: int, 
     return Split(fitted, judged, [look for part in parts for looks in part for look in looks], parts[0])
 
 
-def _pairs(cfg: DictConfig, budget: Budget, matcher: Matcher) -> dict[str, Split]:
-    """Pairs with truth: a whole one is a scene; of the one that `real` names either half is."""
+def _pairs(
+    cfg: DictConfig, budget: Budget, matcher: Matcher, real: Pair | None, gaze: tuple[float, float] | None
+) -> dict[str, Split]:
+    """Pairs with truth: a whole one is a scene; of the real one either half is."""
     retina = build_sensor(cfg)[1]
     found: dict[str, Split] = {}
     for k, name in enumerate(cfg.pairs):
@@ -146,10 +160,9 @@ def _pairs(cfg: DictConfig, budget: Budget, matcher: Matcher) -> dict[str, Split
         data, title = _known(look.data), Path(str(name)).name
         require(title not in (*found, "simulated", "real", "real_left"), f"pairs[{k}]", name, "a name of its own")
         found[title] = Split(data, data, [look], [], left_out=True)
-    if cfg.real:
-        pair = load_pair(cfg)
-        heed(pair.faults, True)
-        look = look_at_pair(pair, retina, gaze_of(cfg, pair), budget, matcher)
+    if real is not None:
+        heed(real.faults, True)
+        look = look_at_pair(real, retina, gaze, budget, matcher)
         column = look.data.place_px[:, 0]
         # the retina looks at the picture's middle, or at the gaze
         left, right = (_known(select(look.data, half)) for half in (column < 0, column >= 0))

@@ -25,7 +25,7 @@ from torchfovea.setting import SettingError
 from torchfovea.sim.scene import Scene
 from torchfovea.sim.world import World
 
-__all__ = ["SceneTask", "looks_at", "looks_at_scenes", "random_gazes"]
+__all__ = ["SceneTask", "looks_at", "looks_at_scenes", "random_gazes", "viewed"]
 
 
 class SceneTask(NamedTuple):
@@ -65,8 +65,7 @@ def looks_at_scenes(tasks: list[SceneTask]) -> list[list[Truths]]:
 
 def looks_at(task: SceneTask) -> list[Truths]:
     """Random looks at one scene."""
-    sized = task.cfg.copy()
-    sized.sensor.fov_deg = task.fov_deg
+    sized = viewed(task.cfg, task.fov_deg)
     camera, retina = build_sensor(sized)
     scene = build_scene_of(sized, build_head(sized), task.seed)
     world = World(
@@ -81,6 +80,13 @@ def looks_at(task: SceneTask) -> list[Truths]:
     gazes = random_gazes(scene, world, task.looks, torch.Generator().manual_seed(task.seed))
     matcher = build_matcher(sized)
     return [look_at_world(world, gaze, retina, task.budget, matcher) for gaze in gazes]
+
+
+def viewed(cfg: DictConfig, fov_deg: float) -> DictConfig:
+    """The same settings with another field of view."""
+    changed = cfg.copy()
+    changed.sensor.fov_deg = fov_deg
+    return changed
 
 
 def random_gazes(scene: Scene, world: World, count: int, generator: torch.Generator) -> list[Gaze]:

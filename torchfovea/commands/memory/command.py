@@ -7,12 +7,13 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
 
-from torchfovea.commands.memory.honesty import study_honesty
+from torchfovea.commands.memory.honesty import plan_honesty, study_honesty
 from torchfovea.commands.memory.moving import study_moving, study_resampling
 from torchfovea.commands.memory.study import Rows, study_encoders, study_fusion
 from torchfovea.commands.shared.build import build_arena, build_cells, build_observer, choice, number, whole
 from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.memories import loaded_memory, memory_path
+from torchfovea.commands.shared.rehearsal import rehearse
 from torchfovea.files import write_csv, write_result
 from torchfovea.memory.nearest import neighbour_spacing_rad
 from torchfovea.memory.store import save_memory
@@ -33,12 +34,14 @@ STUDIES = {
 
 def run(cfg: DictConfig) -> float:
     """Draw the configured bias, or run a study; the score is the number of cells near the target, or of rows."""
+    observer, seed = build_observer(cfg), whole(cfg, "seed", 0)
+    rehearse(cfg, observer.head, observer)
+    whole(cfg, "looks_per_move", 0), plan_honesty(cfg)
+    arena = build_arena(cfg, observer, seed)
     if OmegaConf.select(cfg, "study") is not None:
         return _study(cfg, choice(cfg, "study", tuple(STUDIES)))
     from torchfovea.commands.memory.pictures import draw_memory
 
-    observer, folder, seed = build_observer(cfg), run_folder(), whole(cfg, "seed", 0)
-    arena = build_arena(cfg, observer, seed)
     toward = torch.nn.functional.normalize(arena.world.scene.nearest_point_e.double(), dim=-1)
     if OmegaConf.select(cfg, "memory.means", default="none") is None:  # a bias that is aimed at the scene's own target
         cfg = OmegaConf.merge(cfg, {"memory": {"means": [toward.tolist()]}})  # type: ignore[assignment]
@@ -47,6 +50,7 @@ def run(cfg: DictConfig) -> float:
         cells = build_cells(cfg, observer.head, torch.Generator().manual_seed(seed), torch.float64)
     else:
         cells = loaded.cells.double()
+    folder = run_folder()
     if saved is not None:
         save_memory(saved, new_memory(observer, cells.float()))
     truth = arena.truth(cells)

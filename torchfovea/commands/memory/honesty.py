@@ -23,7 +23,7 @@ from torchfovea.setting import require
 from torchfovea.sim.arena import SimulatedArena
 from torchfovea.studies.significance import bootstrap_interval
 
-__all__ = ["study_honesty"]
+__all__ = ["plan_honesty", "study_honesty"]
 
 SENSORS = ("sgbm", "sweep", "geometric")
 FIGURES = ("nees_mean", "coverage_50", "coverage_95", "outlier_share", "median_error", "mean_error")
@@ -54,7 +54,7 @@ def study_honesty(cfg: DictConfig, rows: Rows) -> None:
     """
     rows.labels, rows.shown = ("sensor", "cells", "looks"), len(FIGURES)
     rows.names = (*FIGURES, *INTERVALS, *BESIDE, *STRADDLING)
-    sensors, counts, marks = _plan(cfg)
+    sensors, counts, marks = plan_honesty(cfg)
     scenes, seed = whole(cfg, "episodes"), whole(cfg, "seed", 0)
     settings = {name: _settings(cfg, name) for name in sensors}
     observers = {name: build_observer(settings[name]) for name in sensors}
@@ -82,7 +82,7 @@ def study_honesty(cfg: DictConfig, rows: Rows) -> None:
     rows.rows += [(*labels, *_figures(parts)) for labels, parts in found.items()]
 
 
-def _plan(cfg: DictConfig) -> tuple[list[str], list[int], list[int]]:
+def plan_honesty(cfg: DictConfig) -> tuple[list[str], list[int], list[int]]:
     """The sensors, numbers of cells and looks of the study's settings."""
     sensors = OmegaConf.select(cfg, "honesty.sensors")
     good = OmegaConf.is_list(sensors) and len(sensors) > 0 and all(s in SENSORS for s in sensors)

@@ -19,6 +19,7 @@ from torchfovea.commands.shared.cameras import OF_FILES, cameras_of_files
 from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.memories import loaded_memory, memory_path
 from torchfovea.commands.shared.progress import progress_bar
+from torchfovea.commands.shared.rehearsal import rehearse
 from torchfovea.commands.shared.rollout import sample_of
 from torchfovea.commands.shared.settings import construct, whole
 from torchfovea.commands.shared.strategy import build_strategy
@@ -68,13 +69,16 @@ class Replayed(NamedTuple):
 def run(cfg: DictConfig) -> float | None:
     """Play a recording; the memory's mean information is what a sweeper sees."""
     refuse_unread("sensor.fov_deg", "sensor.camera", "sensor.source_px")
-    folder, recording = run_folder(), open_recording(cfg)
+    recording = open_recording(cfg)
     require(isinstance(cfg.skip, bool), "skip", cfg.skip, "true or false")
     require(isinstance(cfg.picture, bool), "picture", cfg.picture, "true or false")
     watched = check_viewer(cfg)
     cfg = told_by(cfg, recording.calibration)
     observer = observer_of(build_observer(cfg), recording.calibration)
+    rehearse(cfg, observer.head, observer)
     matcher, strategy, saved = build_match(cfg), build_strategy(cfg, observer), memory_path(cfg, "memory.save")
+    ours = isinstance(matcher, Matcher) and not isinstance(matcher.params, External)
+    ahead, folder = whole(cfg, "ahead", 0) * ours, run_folder()
     generator = torch.Generator().manual_seed(whole(cfg, "seed", 0))
     memory = loaded_memory(cfg, observer)
     if memory is None:
@@ -85,8 +89,6 @@ def run(cfg: DictConfig) -> float | None:
         passed.append(str(error))
         Console(stderr=True).print(f"replay: passed over: {error}", highlight=False, markup=False, soft_wrap=True)
 
-    ours = isinstance(matcher, Matcher) and not isinstance(matcher.params, External)
-    ahead = whole(cfg, "ahead", 0) * ours
     robot = Playback(recording, observer, matcher, sample_of(cfg), pass_over if cfg.skip else None, ahead)
     glances = search(robot, observer, memory, len(recording), generator, strategy)
     with viewers(cfg, folder, observer, "replay") as show:

@@ -8,20 +8,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
-from torchfovea.commands.reproduce.cells import METRICS, CellTask, cells_of, in_family, run_task, task_name
-from torchfovea.commands.reproduce.claims import Claim, Verdict, judge_claims, read_claims, rows_where
+from torchfovea.commands.reproduce.cells import METRICS, CellTask, run_task, task_name
+from torchfovea.commands.reproduce.checks import checked
+from torchfovea.commands.reproduce.claims import Claim, Verdict, judge_claims, rows_where
 from torchfovea.commands.reproduce.fig5 import judge_fig5
 from torchfovea.commands.reproduce.report import decidable, shown, write_report
-from torchfovea.commands.shared.build import whole
 from torchfovea.commands.shared.composed import config_folders
 from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.manifest import complete, finished, read_kept, write_kept
 from torchfovea.commands.shared.mistakes import describe
-from torchfovea.commands.shared.parallel import spread, workers_of
+from torchfovea.commands.shared.parallel import spread
 from torchfovea.commands.shared.progress import progress_bar
 from torchfovea.files import write_csv, write_json
 from torchfovea.setting import SettingError, require
@@ -36,18 +36,13 @@ Row = dict[str, Any]
 
 def run(cfg: DictConfig) -> float:
     """Run or resume a reproduction; the number of claims that hold is what a sweeper sees."""
+    plain, claims, tasks, workers = checked(cfg)
     folder = run_folder()
-    whole(cfg, "episodes", 2), whole(cfg, "saccades"), whole(cfg, "seed", 0), whole(cfg, "workers")
-    whole(cfg, "memory.cells")
-    whole(cfg, "sensor.receptive_fields", 16)
     done = finished(cfg, folder, "claims_hold")
     if done is not None:
         return done
-    settings: Any = OmegaConf.to_container(cfg, resolve=True)
-    plain = in_family(settings)
-    claims = read_claims(plain["claims"])
     start = time.perf_counter()
-    rows = _episodes(cells_of(plain), folder / "cells", *workers_of(cfg))
+    rows = _episodes(tasks, folder / "cells", *workers)
     seconds = time.perf_counter() - start
     write_csv(folder / "episodes.csv", _COLUMNS, [[row[c] for c in _COLUMNS] for row in rows])
     counting = rows_where(rows, plain["counts"])

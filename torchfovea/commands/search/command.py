@@ -23,24 +23,16 @@ from torchfovea.commands.search.remembering import (
     rounds,
     write_bias,
 )
-from torchfovea.commands.shared.build import (
-    build_match,
-    build_motor,
-    build_noise,
-    build_observer,
-    build_renderer,
-    build_route,
-    name_of,
-)
+from torchfovea.commands.shared.build import build_observer
 from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.figures import EPISODE_COLUMNS, episode_row
 from torchfovea.commands.shared.manifest import complete, finished
-from torchfovea.commands.shared.memories import loaded_memory, memory_path
+from torchfovea.commands.shared.memories import memory_path
 from torchfovea.commands.shared.parallel import spread, workers_of
 from torchfovea.commands.shared.progress import progress_bar
-from torchfovea.commands.shared.rollout import batched, device_of, kept_scene, one_episode, roll_out, sample_of
-from torchfovea.commands.shared.settings import choice, number, whole
-from torchfovea.commands.shared.strategy import build_stop, build_strategy
+from torchfovea.commands.shared.rehearsal import rehearse
+from torchfovea.commands.shared.rollout import batched, device_of, kept_scene, one_episode, roll_out
+from torchfovea.commands.shared.settings import choice, whole
 from torchfovea.commands.shared.viewers import Show, check_viewer, viewers
 from torchfovea.episode import Each, Episode
 from torchfovea.files import write_csv
@@ -63,23 +55,21 @@ SACCADE_COLUMNS = (
 def run(cfg: DictConfig) -> float:
     """Run the episodes of a configuration; the mean gap per saccade is what a sweeper sees."""
     episodes, saccades, seed = whole(cfg, "episodes"), whole(cfg, "saccades"), whole(cfg, "seed", 0)
-    observer, folder = build_observer(cfg), run_folder()
+    observer = build_observer(cfg)
     choice(cfg, "fidelity", ("photometric", "geometric"))
     reads = observer.classes is None or batched(cfg)
     require(reads, "reward", "of_class", "fidelity=geometric motor=instant, whose receptive fields read marks")
-    build_renderer(cfg) if cfg.fidelity == "photometric" else name_of(cfg, "renderer")
-    device_of(cfg), sample_of(cfg), whole(cfg, "batch"), workers_of(cfg), number(cfg, "far_m")
-    number(cfg, "near_target_m"), build_stop(cfg)
+    device_of(cfg), whole(cfg, "batch"), workers_of(cfg)
     require(isinstance(cfg.picture, bool), "picture", cfg.picture, "true or false")
     require(isinstance(cfg.record, bool), "record", cfg.record, "true or false")
     require(not (cfg.record and cfg.fidelity == "geometric"), "record", True, "images, fidelity=photometric")
     watched = check_viewer(cfg)
     alone = not watched or workers_of(cfg)[0] == 1
     require(alone, "workers", cfg.workers, "1 with viewer or video, which follow the last episode")
-    # mistakes come first, also in what is not used
-    build_strategy(cfg, observer), build_match(cfg, observer), build_motor(cfg), build_route(cfg), build_noise(cfg)
-    loaded_memory(cfg, observer), check_resample(cfg, observer)
+    rehearse(cfg, observer.head, observer)
+    check_resample(cfg, observer)
     saved, both = memory_path(cfg, "memory.save"), sensors_of(cfg, observer)
+    folder = run_folder()
     done = finished(cfg, folder)
     if done is not None:
         return done

@@ -53,14 +53,14 @@ def run(cfg: DictConfig) -> float | None:
     views, free = _looking(cfg, pair)
     budget, whole = build_budget(cfg, pair=True), choice(cfg, "span", ("whole", "shorter")) == "whole"
     printed = choice(cfg, "budget.sigma_points", ("ours", "paper")) == "paper"
-    both = retinas_of(cfg, retina, budget)
+    both, folder = retinas_of(cfg, retina, budget), run_folder()
     found_out = examine(pair, views, health)
     pair, told = pair._replace(disparity=found_out.disparity), found_out.warnings
     if free:
         views = met(views, match.nearest_m if isinstance(match, Matcher) else 0.3)
         _say(_MET.format(*views.gazes_px[1]))
     views = views.whole() if whole else views
-    budget, folder = misaligned(budget, found_out.rows_px), run_folder()
+    budget = misaligned(budget, found_out.rows_px)
 
     sensed, found = match_and_sense(match, views, printed, retina, budget)
     foreign = isinstance(match, Matcher) and isinstance(match.params, External) and views.rectified

@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from torchfovea.commands.shared.config import conf_dir
-from torchfovea.commands.shared.settings import construct, whole
+from torchfovea.commands.shared.settings import choice, construct, whole
 from torchfovea.files import replacing
 from torchfovea.sensing.correspondence import Budget
 from torchfovea.setting import SettingError, require
@@ -19,6 +19,7 @@ __all__ = ["build_budget", "load_budget", "made_for", "shipped", "write_budget"]
 
 NUMBERS = tuple(field.name for field in fields(Budget) if field.name != "source_px")
 KEYS = (*NUMBERS, "source", "sigma_points", "made_for")
+PURPOSE = ("matcher", "layout", "receptive_fields", "fov_deg", "source_px")
 SIZE = 2.0  # a source this many times larger or smaller is another one
 
 
@@ -36,12 +37,14 @@ def build_budget(cfg: DictConfig, pair: bool = False) -> Budget:
         SettingError: for a budget that lacks a number or has one that no budget knows, and for impossible numbers.
     """
     node = _checked(cfg.budget, "budget")
+    choice(cfg, "budget.sigma_points", ("ours", "paper"))
+    source_px = whole(cfg, "sensor.source_px", 16)
     if any(node[name] is None for name in NUMBERS):
         node = _filled(cfg, node)
     require(isinstance(node["source"], bool), "budget.source", node["source"], "true or false")
     if node["made_for"] is not None:
         _compare(cfg, node["made_for"], pair)
-    source = whole(cfg, "sensor.source_px", 16) if node["source"] else None
+    source = source_px if node["source"] else None
     return construct(Budget, {**{name: node[name] for name in NUMBERS}, "source_px": source}, "budget")
 
 
@@ -102,6 +105,10 @@ def _checked(node: Any, where: str) -> dict[str, Any]:
         raise SettingError(f"{where}.{missing[0]} = missing: expected all of {', '.join(KEYS)}")
     if unknown:
         raise SettingError(f"{where}.{unknown[0]} = {values[unknown[0]]}: expected one of {', '.join(KEYS)}")
+    purpose = values["made_for"]
+    told = purpose is None or (isinstance(purpose, dict) and set(PURPOSE) <= set(purpose))
+    expected = f"null, or what `torchfovea calibrate` writes: {', '.join(PURPOSE)}"
+    require(told, f"{where}.made_for", purpose, expected)
     return {str(name): value for name, value in values.items()}
 
 
@@ -121,10 +128,6 @@ def _filled(cfg: DictConfig, node: dict[str, Any]) -> dict[str, Any]:
 
 def _compare(cfg: DictConfig, purpose: Any, pair: bool) -> None:
     """Say in one line where a budget was made for something else."""
-    require(isinstance(purpose, dict), "budget.made_for", purpose, "null, or what `torchfovea calibrate` writes")
-    known = ("matcher", "layout", "receptive_fields", "fov_deg", "source_px")
-    for key in known:
-        require(key in purpose, f"budget.made_for.{key}", "missing", ", ".join(known))
     other = [] if cfg.sensor.layout == purpose["layout"] else [f"sensor.layout = {purpose['layout']}"]
     matcher = OmegaConf.to_container(cfg.matcher, resolve=True)
     assert isinstance(matcher, dict)

@@ -12,7 +12,7 @@ from torchfovea.stereo.calibration_files import KINDS, Options, StereoCalibratio
 from torchfovea.stereo.calibration_formats import LENSES
 from torchfovea.stereo.rig import StereoRig
 
-__all__ = ["OF_FILES", "cameras_of", "cameras_of_files"]
+__all__ = ["BY_HAND", "OF_FILES", "cameras_of", "cameras_of_files"]
 
 BY_HAND = ("focal_px", "cx_px", "cy_px", "baseline_m")
 OF_FILES = ("calibration_right", "calibration_lens", "calibration_cameras", "calibration_unit_m")

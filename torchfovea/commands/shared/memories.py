@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from omegaconf import DictConfig, OmegaConf
 
 from torchfovea.memory.egosphere import Memory
@@ -11,8 +12,9 @@ from torchfovea.memory.sphere import DirectionMixture
 from torchfovea.memory.store import check_memory_path, load_memory
 from torchfovea.perception import Observer, check_owner
 from torchfovea.setting import require
+from torchfovea.sim.model import Scene
 
-__all__ = ["loaded_memory", "memory_path", "mixture_settings", "mixture_yaml"]
+__all__ = ["aimed", "loaded_memory", "memory_path", "mixture_settings", "mixture_yaml"]
 
 
 def memory_path(cfg: DictConfig, setting: str) -> str | None:
@@ -37,6 +39,16 @@ def loaded_memory(cfg: DictConfig, observer: Observer) -> Memory | None:
     require(memory.cells.dim() == 2, "memory.load", path, f"one memory, and no batch of {len(memory.cells)}")
     check_owner(observer, memory)
     return memory
+
+
+def aimed(cfg: DictConfig, scene: Scene) -> DictConfig:
+    """The settings with a memory that is centred on the scene's own target, if it has no mean of its own."""
+    if "means" not in cfg.memory or cfg.memory.means is not None:
+        return cfg
+    mean = torch.nn.functional.normalize(scene.nearest_point_e, dim=-1).tolist()
+    merged = OmegaConf.merge(cfg, {"memory": {"means": [mean]}})
+    assert isinstance(merged, DictConfig)
+    return merged
 
 
 def mixture_settings(mixture: DirectionMixture) -> dict[str, Any]:

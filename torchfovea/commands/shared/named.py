@@ -44,7 +44,8 @@ def name_of(cfg: DictConfig, group: str, key: str = "name") -> str:
     if name not in ours and (unknown or target in ours.values()):
         raise SettingError(f"{group}.{key} = {name}: expected one of {', '.join(ours)}, by {group}={name}")
     if target is not None and ours.get(name) not in (None, target):
-        raise SettingError(f"{group}.{key} = {name}: expected the name of what {group} is; for another, {group}={name}")
+        expected = f"{ours[name]}, which {name} is, or another {group}.{key}"
+        raise SettingError(f"{group}._target_ = {target}: expected {expected}; for ours, {group}={name}")
     return str(name)
 
 

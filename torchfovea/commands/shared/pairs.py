@@ -10,7 +10,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from torchfovea.commands.shared.cameras import cameras_of
+from torchfovea.commands.shared.cameras import BY_HAND, OF_FILES, cameras_of
 from torchfovea.commands.shared.images import exposed, read_levels
 from torchfovea.commands.shared.settings import choice, is_number
 from torchfovea.commands.shared.truth import load_truth
@@ -22,8 +22,13 @@ from torchfovea.stereo.health import Fault
 from torchfovea.stereo.rig import StereoRig
 from torchfovea.stereo.views import Views, posed_views, rectified_views
 
-__all__ = ["Pair", "gaze_of", "load_folder", "load_pair", "motorcycle", "named_pair"]
+__all__ = ["OWN", "Pair", "check_named", "gaze_of", "load_folder", "load_pair", "motorcycle", "named_pair"]
 
+# what tells of a pair of one's own
+OWN = (
+    "left", "right", "calibration", "calibration_images", *OF_FILES, *BY_HAND, "doffs_px", "disparity",
+    "disparity_unit_px", "disparity_unknown", "mask",
+)  # fmt: skip
 SUFFIXES = (".npy", ".npz", ".pfm", ".png")
 
 
@@ -76,6 +81,11 @@ def load_pair(cfg: DictConfig) -> Pair:
     """
     if cfg.pair is not None:
         choice(cfg, "pair", ("motorcycle",))
+        for name in OWN:
+            alone = OmegaConf.select(cfg, name) in (None, "auto", 0)
+            require(
+                alone, name, OmegaConf.select(cfg, name), "none of your own with pair=motorcycle; pair=null is without"
+            )
         return motorcycle()
     for name in ("left", "right"):
         if cfg[name] is None:
@@ -91,9 +101,15 @@ def load_pair(cfg: DictConfig) -> Pair:
     return _pair(left, right, cameras, truth)._replace(seen=seen, faults=faults)
 
 
+def check_named(name: Any, where: str) -> None:
+    """Raise SettingError for what `named_pair` cannot find."""
+    known = isinstance(name, str) and (name == "motorcycle" or Path(name).is_dir())
+    require(known, where, name, "motorcycle, or a folder with left.png, right.png, calib.txt and disparity")
+
+
 def named_pair(name: Any, where: str) -> Pair:
     """One of a list of pairs: ``motorcycle``, or a folder (`load_folder`)."""
-    require(isinstance(name, str), where, name, "motorcycle, or a folder")
+    check_named(name, where)
     return motorcycle() if name == "motorcycle" else load_folder(Path(name), where)
 
 
@@ -108,7 +124,6 @@ def load_folder(folder: Path, where: str) -> Pair:
     Raises:
         SettingError: for what is missing or does not fit.
     """
-    require(folder.is_dir(), where, folder, "motorcycle, or a folder with left.png, right.png, calib.txt and disparity")
     left, right, faults = _images(folder / "left.png", folder / "right.png", f"{where}: ")
     found = [folder / f"disparity{suffix}" for suffix in SUFFIXES if (folder / f"disparity{suffix}").is_file()]
     require(len(found) == 1, f"{where}: {folder}/disparity", len(found), "one file (.npy, .npz, .pfm or .png)")

@@ -30,6 +30,8 @@ def workers_of(cfg: DictConfig) -> tuple[int, str]:
     """The settings `workers`, how many processes, and `backend`, of joblib, that they belong to."""
     backend = OmegaConf.select(cfg, "backend")
     require(isinstance(backend, str) and bool(backend), "backend", backend, "loky, or another backend of joblib's")
+    with _configured(str(backend)):
+        pass
     return whole(cfg, "workers"), str(backend)
 
 
@@ -58,11 +60,7 @@ def spread(
         # joblib keeps its processes for the next call: not for one from elsewhere, which finds other modules
         origin = os.getpid(), os.getcwd(), tuple(sys.path)
         settings = {"inner_max_num_threads": 1, "initializer": _begin, "initargs": origin}
-    try:
-        chosen = parallel_config(backend, n_jobs=min(workers, len(numbered)), **settings)
-    except (ValueError, ImportError) as error:
-        raise SettingError(f"backend = {backend}: expected loky, or another backend of joblib's ({error})") from error
-    with chosen:
+    with _configured(backend, n_jobs=min(workers, len(numbered)), **settings):
         together = Parallel(return_as="generator_unordered")
     found = together(delayed(_attempt)(function, k, item) for k, item in numbered)
     try:
@@ -74,6 +72,14 @@ def spread(
         with warnings.catch_warnings():  # who goes away early needs no advice to ask for less
             warnings.simplefilter("ignore", UserWarning)
             found.close()
+
+
+def _configured(backend: str, **settings: Any) -> parallel_config:
+    """Joblib's configuration with a backend that there is."""
+    try:
+        return parallel_config(backend, **settings)
+    except (ValueError, ImportError) as error:
+        raise SettingError(f"backend = {backend}: expected loky, or another backend of joblib's ({error})") from error
 
 
 def _attempt(function: Callable[[Item], Result], number: int, item: Item) -> tuple[int, Result | Exception]:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchfovea.arena import Truth
 from torchfovea.commands.shared.build import build_arena, build_cells, build_motor, build_scene_of, name_of
-from torchfovea.commands.shared.memories import loaded_memory
+from torchfovea.commands.shared.memories import aimed, loaded_memory
 from torchfovea.commands.shared.settings import choice, number, whole
 from torchfovea.commands.shared.strategy import build_stop, build_strategy
 from torchfovea.deciding.strategies import Strategy
@@ -79,7 +79,7 @@ def one_episode(
         arena.record(record)
     memory = loaded_memory(cfg, observer)
     if memory is None:
-        memory = new_memory(observer, build_cells(_aimed(cfg, arena.world.scene), observer.head, generator))
+        memory = new_memory(observer, build_cells(aimed(cfg, arena.world.scene), observer.head, generator))
     truth = arena.truth(memory.cells)
     if strategy is None:
         strategy = build_strategy(cfg, observer, _aim(truth, number(cfg, "near_target_m")))
@@ -100,16 +100,6 @@ def _aim(truth: Truth, near_m: float) -> Tensor:
     near = near_target(truth.cell_points, truth.nearest_point, near_m)
     point = truth.cell_points[near].mean(0) if bool(near.any()) else truth.nearest_point
     return torch.nn.functional.normalize(point, dim=-1)
-
-
-def _aimed(cfg: DictConfig, scene: Scene) -> DictConfig:
-    """The settings with a memory that is centred on the scene's own target, if it has no mean of its own."""
-    if "means" not in cfg.memory or cfg.memory.means is not None:
-        return cfg
-    mean = torch.nn.functional.normalize(scene.nearest_point_e, dim=-1).tolist()
-    merged = OmegaConf.merge(cfg, {"memory": {"means": [mean]}})
-    assert isinstance(merged, DictConfig)
-    return merged
 
 
 def _settings(text: str) -> DictConfig:
@@ -142,7 +132,7 @@ def prepare_episode(cfg: DictConfig, observer: Observer, seed: int) -> tuple[Sce
     generator, memory = torch.Generator().manual_seed(seed), loaded_memory(cfg, observer)
     if memory is not None:
         return scene, memory, truth_of(scene, memory.cells), generator
-    cells = OmegaConf.masked_copy(_aimed(cfg, scene), ["memory"])
+    cells = OmegaConf.masked_copy(aimed(cfg, scene), ["memory"])
     memory, state = _start(OmegaConf.to_yaml(cells, resolve=True), observer, seed)
     generator.set_state(state)
     return scene, memory, truth_of(scene, memory.cells), generator

@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchfovea.setting import require
 
-__all__ = ["choice", "construct", "is_number", "number", "typed", "whole", "within"]
+__all__ = ["choice", "construct", "is_number", "is_whole", "number", "typed", "whole", "within"]
 
 T = TypeVar("T")
 
@@ -100,6 +100,11 @@ def within(cfg: DictConfig, setting: str, least: float, most: float, expected: s
     require(is_number(value), setting, value, f"a number: {expected}")
     require(least <= value <= most, setting, value, expected)
     return float(value)
+
+
+def is_whole(value: Any) -> bool:
+    """Whether it is a whole number, however it is written (1e9), and not a truth value."""
+    return is_number(value) and float(value).is_integer()
 
 
 def is_number(value: Any) -> bool:

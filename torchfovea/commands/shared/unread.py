@@ -9,11 +9,12 @@ from torchfovea.setting import SettingError
 __all__ = ["refuse_unread"]
 
 
-def refuse_unread(*settings: str) -> None:
+def refuse_unread(*settings: str, only: str = "") -> None:
     """Refuse an override of what the running command does not read.
 
     Args:
         settings: dotted names; ``group.*`` stands for a group's choice and all of its settings.
+        only: when it would read them; by default never.
 
     Raises:
         SettingError: for an override of one of them.
@@ -26,4 +27,5 @@ def refuse_unread(*settings: str) -> None:
         for setting in settings:
             group = setting.removesuffix(".*")
             if key == group or (group != setting and key.startswith(f"{group}.")):
-                raise SettingError(f"{key} = {value}: expected no such setting, {job.job.config_name} does not read it")
+                reads = f"reads it {only} only" if only else "does not read it"
+                raise SettingError(f"{key} = {value}: expected no such setting, {job.job.config_name} {reads}")

@@ -108,11 +108,12 @@ def _run(cfg: DictConfig) -> float:
     merged = {str(name): value for name, value in settings.items()} | sizes
     schedule = construct(Schedule, merged, "tune")
     heldout = Heldout(sizes["heldout_scenes"], whole(cfg, "heldout_seed", 0))
-    start, folder = build_start(cfg, problem.shape), run_folder()
-    checkpoint = folder / "checkpoint.pt"
+    start = build_start(cfg, problem.shape)
     if cfg.resume is not None:
         there = isinstance(cfg.resume, str) and Path(cfg.resume).is_file()
         require(there, "resume", cfg.resume, "a checkpoint.pt that exists")
+    folder = run_folder()
+    checkpoint = folder / "checkpoint.pt"
     before = finished(cfg, folder, "heldout.tuned.gap_per_saccade")
     if before is not None:
         return before
