@@ -24,7 +24,14 @@ import numpy as np
 
 SENSOR = ["sensor.receptive_fields=2000", "sensor.source_px=200"]
 SEARCH = [*SENSOR, "memory.cells=300", "saccades=4", "episodes=3", "seed=5"]
-TUNE = ["profile=quick", "episodes=96", "warm_episodes=32", "validations=2", "validation_scenes=16", "heldout_scenes=32"]
+TUNE = [
+    "profile=quick",
+    "episodes=96",
+    "warm_episodes=32",
+    "validations=2",
+    "validation_scenes=16",
+    "heldout_scenes=32",
+]
 # Not of the figures: how long it took, and on what
 TIMES = ("seconds", "manifest.json", "config_hash", "settings_hash", "versions", "times", ".log", ".hydra", "cpu")
 PICTURES = (".png", ".gif", ".html", ".svg")
@@ -76,7 +83,9 @@ COMMANDS: dict[str, tuple[list[str], tuple[Change, ...]]] = {
 
 def main(chosen: list[str]) -> None:
     """Run, compare and print the table."""
-    print("| command | " + " | ".join(("change", "tables and results", "pictures")) + " |\n|---|---|---|---|", flush=True)
+    print(
+        "| command | " + " | ".join(("change", "tables and results", "pictures")) + " |\n|---|---|---|---|", flush=True
+    )
     with tempfile.TemporaryDirectory() as place:
         recording = Path(place) / "record"
         if not chosen or "replay" in chosen:
@@ -85,10 +94,10 @@ def main(chosen: list[str]) -> None:
             if chosen and words[0] not in chosen:
                 continue
             words = [word.replace("RECORDING", str(recording / "recording")) for word in words]
-            first = Path(place) / f"{name} first"
+            first = Path(place) / "first" / name.replace(", ", "_").replace(" ", "_")
             run(words, Change("first"), first)
             for change in changes:
-                other = Path(place) / f"{name} {change.name}"
+                other = Path(place) / change.name.replace(" ", "_") / first.name
                 run(words, change, other)
                 print(f"| {name} | {change.name} | {' | '.join(compared(first, other))} |", flush=True)
 

@@ -22,7 +22,7 @@ FIGURES = 6  # shown on the screen
 def run(cfg: DictConfig) -> float:
     """Write collect.csv: a row for each run, its overrides and figures; the number of rows is what a sweeper sees."""
     source = Path(str(cfg.dir)).expanduser()
-    require(source.is_dir(), "dir", source, "a folder of runs")
+    require(bool(str(cfg.dir)) and source.is_dir(), "dir", source, "a folder of runs")
     rows, unfinished, corrupt = [], [], []
     for folder in sorted(path.parent for path in source.rglob(".hydra")):
         name = str(folder.relative_to(source))

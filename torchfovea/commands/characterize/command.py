@@ -54,7 +54,7 @@ FULL = {
 
 def run(cfg: DictConfig) -> float:
     """Characterize both sensors; the smallest advantage of the foveal one is what a sweeper sees."""
-    refuse_unread("budget.source", "budget.sigma_points")
+    refuse_unread("budget.source", "budget.sigma_points", "budget.made_for")
     cfg = sized(cfg, QUICK, FULL)
     for name in ("propagation.run", "realised.run"):
         asked = OmegaConf.select(cfg, name)

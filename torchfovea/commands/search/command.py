@@ -23,7 +23,7 @@ from torchfovea.commands.search.remembering import (
     rounds,
     write_bias,
 )
-from torchfovea.commands.shared.build import build_observer
+from torchfovea.commands.shared.build import build_observer, build_route
 from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.figures import EPISODE_COLUMNS, episode_row
 from torchfovea.commands.shared.manifest import complete, finished

@@ -113,7 +113,8 @@ def _checked(node: Any, where: str) -> dict[str, Any]:
 
 
 def _filled(cfg: DictConfig, node: dict[str, Any]) -> dict[str, Any]:
-    geometric = OmegaConf.select(cfg, "fidelity") == "geometric"  # whose noise is what the budget says, and independent
+    # where nothing is matched, the noise is what the budget says, and independent
+    geometric = OmegaConf.select(cfg, "fidelity") == "geometric" or "matcher" not in cfg
     path = Path(conf_dir()) / "budget" / "ours.yaml" if geometric else shipped(cfg)
     if path is None:
         _say(

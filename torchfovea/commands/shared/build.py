@@ -87,8 +87,6 @@ def build_camera(cfg: DictConfig, radius_px: float) -> Camera:
 def build_observer(cfg: DictConfig) -> Observer:
     """The observer that a configuration describes; its strategy is `torchfovea.commands.shared.strategy`'s to build."""
     camera, retina = build_sensor(cfg)
-    if "matcher" in cfg:  # before the budget says for which it was made
-        _made_matcher(cfg)
     budget = build_budget(cfg)
     printed = choice(cfg, "budget.sigma_points", ("ours", "paper")) == "paper"
     return Observer(
@@ -231,7 +229,11 @@ def build_match(cfg: DictConfig, observer: Observer | None = None) -> Match:
         cfg: with the group matcher.
         observer: whose memory the matcher may ask; None: there is none.
     """
-    made, form = _made_matcher(cfg)
+    name_of(cfg, "matcher")
+    form = "a function (views, retina, budget) that returns (Correspondences, found)"
+    target = OmegaConf.select(cfg, "matcher._target_") or targets_of("matcher", "name").get(cfg.matcher.name)
+    ours = isinstance(target, str) and target.startswith("torchfovea.")
+    made = build_named(cfg, "matcher", form, MATCHER if ours else ("name",))
     if isinstance(made, SGBM | Sweep | External):
         source = cfg.matcher.get("source")
         if isinstance(source, DictConfig):
@@ -245,15 +247,6 @@ def build_match(cfg: DictConfig, observer: Observer | None = None) -> Match:
     require(callable(made), "matcher", type(made).__name__, form)
     match: Match = made
     return match
-
-
-def _made_matcher(cfg: DictConfig) -> tuple[Any, str]:
-    """What the group `matcher` names, and what is expected of it."""
-    name_of(cfg, "matcher")
-    form = "a function (views, retina, budget) that returns (Correspondences, found)"
-    target = OmegaConf.select(cfg, "matcher._target_") or targets_of("matcher", "name").get(cfg.matcher.name)
-    ours = isinstance(target, str) and target.startswith("torchfovea.")
-    return build_named(cfg, "matcher", form, MATCHER if ours else ("name",)), form
 
 
 def build_matcher(cfg: DictConfig) -> Matcher:

@@ -59,12 +59,14 @@ EXAMPLES: dict[str, tuple[Any, ...]] = {
     "bag.pan": ("pan",),
     "bag.tilt": ("tilt",),
     "bag.vergence": ("vergence",),
+    "memory.cells": (1,),
     "memory.load": ("memory.npz",),
     "memory.save": ("memory.npz",),
     "memory.resample": ("remembered",),
     "memory.topology": ("geodesic",),
     "stop.probability": (0.05,),
     "sensor.grid": ([1, 1],),
+    "sensor.sample": (8000,),
     "fovs_deg": ([90.0],),
     "pairs": (["motorcycle"],),
     "mine": ([{}],),
@@ -131,10 +133,11 @@ def check_kinds(cfg: DictConfig, command: str) -> None:
         SettingError: for the first such setting.
     """
     kinds = kinds_of(command)
-    for name, value in _settings(OmegaConf.to_container(cfg, resolve=True), kinds):
-        known = kinds[name]
-        if not known.take(value):
-            raise SettingError(f"{name} = {value}: expected {known}")
+    for resolve in (False, True):  # what others stand for comes first
+        for name, value in _settings(OmegaConf.to_container(cfg, resolve=resolve), kinds):
+            known, stands = kinds[name], isinstance(value, str) and "${" in value
+            if not stands and not known.take(value):
+                raise SettingError(f"{name} = {value}: expected {known}")
 
 
 def check_groups(command: str) -> None:

@@ -13,7 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
-from torchfovea.commands.shared.build import build_observer, construct, number, whole
+from torchfovea.commands.shared.build import build_observer, construct, name_of, number, whole
 from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.manifest import complete, finished
 from torchfovea.commands.shared.progress import progress_bar
@@ -63,7 +63,7 @@ def build_problem(cfg: DictConfig) -> Problem:
     distribution = replace(construct(Distribution, node, "distribution"), regions=tuple(map(tuple, regions)))
     cost = read_number(cfg, "saccade_cost", "worth per degree, at least 0", 0.0)
     task = Task(build_observer(cfg), whole(cfg, "saccades", 2), number(cfg, "far_m"), str(cfg.metric), cost)
-    known = cfg.acquisition.name in ("ucb", "weighted")
+    known = name_of(cfg, "acquisition") in ("ucb", "weighted")
     require(known, "acquisition", cfg.acquisition.name, "ucb, whose alpha is tuned, or weighted")
     weights, tuned = _weights(cfg)
     alpha = read_number(cfg, "acquisition.alpha", "a number of at least 0", 0.0)
@@ -102,6 +102,7 @@ def _run(cfg: DictConfig) -> float:
     sizes = {name: value if cfg[name] is None else whole(cfg, name) for name, value in profile.items()}
     refuse_unread(*UNREAD)
     check_study(cfg)
+    whole(cfg, "seed", 0)
     problem = build_problem(cfg)
     settings = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(settings, dict)

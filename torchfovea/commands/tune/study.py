@@ -64,6 +64,7 @@ def check_study(cfg: DictConfig) -> None:
     require(cfg.study in (None, "curves", "gradients"), "study", cfg.study, "null, curves or gradients")
     for name in ("methods", "estimators"):
         require(OmegaConf.is_list(cfg[name]), name, cfg[name], "a list, [...]")
+    whole(cfg, "seeds")
     check_methods([str(method) for method in cfg.methods])
     for name in cfg.estimators:
         require(name in ESTIMATORS, "estimators", name, "any of " + ", ".join(ESTIMATORS))
