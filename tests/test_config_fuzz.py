@@ -7,8 +7,8 @@ a configuration that is composed once for a command; `tests/test_settings.py` go
 
 `scripts/fuzz.sh` tries every override and every option of every group, the suite a sample of them.
 
-Accepted, because nobody is misled: a name of one's own for a bias or a distribution (`memory.name=abc`), a number of the
-right kind but out of range where the command does not read it (`UNREAD`), and whatever is of the right kind in a
+Accepted, because nobody is misled: a name of one's own for a bias or a distribution (`memory.name=abc`), a number of
+the right kind but out of range where the command does not read it (`UNREAD`), and whatever is of the right kind in a
 profile of `reproduce` that is not chosen.
 """
 
