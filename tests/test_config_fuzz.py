@@ -19,6 +19,7 @@ import io
 import os
 import random
 import shutil
+import sys
 import time
 from pathlib import Path
 
@@ -31,6 +32,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from torchfovea import cli
+from torchfovea.commands import doctor
 from torchfovea.commands.shared.config import conf_dir
 from torchfovea.commands.shared.kinds import kinds_of
 from torchfovea.commands.table import COMMANDS
@@ -97,10 +99,12 @@ def sentinel(monkeypatch):
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
     monkeypatch.setattr(HydraConfig.instance(), "cfg", None)
     for command in COMMANDS.values():
-        module = importlib.import_module(command.target.partition(":")[0])
-        monkeypatch.setattr(module, "run_folder", begin)
-        if hasattr(module, "_probe"):  # of doctor, whose only work is to look
-            monkeypatch.setattr(module, "_probe", begin)
+        importlib.import_module(command.target.partition(":")[0])
+    for name, module in list(sys.modules.items()):
+        # of all that ask for it: not of shared.config itself, whose own the command line asks for
+        if name.startswith("torchfovea.commands.") and hasattr(module, "run_folder") and not name.endswith(".config"):
+            monkeypatch.setattr(module, "run_folder", begin)
+    monkeypatch.setattr(doctor, "_probe", begin)  # whose only work is to look
     with initialize_config_dir(conf_dir(), version_base="1.3"):
         yield
     assert not GlobalHydra.instance().is_initialized()
