@@ -328,7 +328,8 @@ def test_doctor_names_a_probe_that_does_not_answer(tmp_path, monkeypatch, capsys
 
 def test_doctor_limit_must_be_a_time(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    fails_with(capsys, "probe_timeout_s = soon: expected a positive number", "probe_timeout_s=soon")
+    fails_with(capsys, "probe_timeout_s = soon: expected a number", "probe_timeout_s=soon")
+    fails_with(capsys, "probe_timeout_s = -1: expected a positive number", "probe_timeout_s=-1")
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals are POSIX")
