@@ -337,7 +337,8 @@ def test_planes_are_matched_by_the_matcher_that_is_asked(tmp_path, capsys, monke
             "vergence_max_deg = 200: expected less than 180: beyond, the eyes look behind the head",
         ),
         ("distances=1", "distances = 1: expected at least 2"),
-        ("advantage_source_px=[3.5]", "advantage_source_px = [3.5]: expected whole numbers, at least 16"),
+        ("advantage_source_px=[3]", "advantage_source_px = [3.0]: expected whole numbers, at least 16"),
+        ("advantage_source_px=[3.5]", "advantage_source_px = [3.5]: expected a list, each of it a whole number"),
         ("realised.distances_m=[-1]", "realised.distances_m = [-1.0]: expected positive distances in metres"),
         ("propagation.ratios=[0]", "propagation.ratios = [0.0]: expected positive numbers"),
         (

@@ -237,10 +237,10 @@ def test_a_whole_reproduction_resumes_and_names_what_is_corrupt(tmp_path, capsys
 
 def test_failed_cells_are_named_and_the_rest_is_kept(tmp_path, capsys):
     folder = tmp_path / "run"
-    changes = ["fig8.others=[pi,nonsense]", "fig9.biases=[unbiased]"]
+    changes = ["fig8.others=[pi,external]", "fig9.biases=[unbiased]"]
     assert main(["reproduce", *SMALL, *changes, f"hydra.run.dir={folder}"]) == 1
     said = capsys.readouterr().err
-    assert "acquisition" in said and "nonsense" in said and "2 of 7 failed" in said
+    assert "acquisition.source" in said and "external" in said and "2 of 7 failed" in said
     assert len(list((folder / "cells").iterdir())) == 5 and not (folder / "result.json").exists()
 
 

@@ -25,7 +25,7 @@ __all__ = ["Kinds", "check_groups", "check_kinds", "kinds_of"]
 
 # Examples of what the files leave null, or to other settings, wherever it stands
 EXAMPLES: dict[str, tuple[Any, ...]] = {
-    "pair": ("motorcycle",),
+    "pair": (None, "motorcycle"),
     "study": ("honesty",),
     "viewer": ("page",),
     "families": ("narrow", ["narrow"]),
@@ -54,6 +54,7 @@ EXAMPLES: dict[str, tuple[Any, ...]] = {
     "gaze_right_px": ([1.0, 1.0], "same"),
     "disparity_unit_px": (1.0,),
     "disparity_unknown": (1.0,),
+    "bag.camera": (None,),
     "bag.joints": ("/joints",),
     "bag.odometry": ("/odom",),
     "bag.pan": ("pan",),
@@ -69,7 +70,8 @@ EXAMPLES: dict[str, tuple[Any, ...]] = {
     "sensor.sample": (None, 8000),
     "fovs_deg": ([90.0],),
     "pairs": (["motorcycle"],),
-    "mine": ([{}],),
+    "mine": (None, [{}]),
+    "entries": (None,),
     "overrides": (["head=human"],),
     "scene_overrides.attention_world": (["head=human"],),
     "distances": (5,),
