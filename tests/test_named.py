@@ -132,7 +132,10 @@ def test_the_wrong_thing_is_named(own, group):
     ("overrides", "message"),
     [
         (["scene.name=attention_word"], r"scene.name = attention_word: expected one of attention_world, cans"),
-        (["scene.name=cans"], r"scene._target_ = torchfovea.sim.scene.AttentionWorld: expected torchfovea.sim.scene.Cans"),
+        (
+            ["scene.name=cans"],
+            r"scene._target_ = torchfovea.sim.scene.AttentionWorld: expected torchfovea.sim.scene.Cans",
+        ),
         (["+scene.size=3"], r"scene.size = 3: expected a setting of AttentionWorld: can_radius_m"),
         (["scene.room.front_m=far"], r"scene.room.front_m = far: expected a number"),
         (["scene.can_radius_m=[1]"], r"scene.can_radius_m = \[1\]: expected a number"),

@@ -79,6 +79,8 @@ EXAMPLES: dict[str, tuple[Any, ...]] = {
     "propagation.samples": (5,),
     "realised.source_px": ([200],),
     "every": (1,),
+    "acquisition.saccades": (10,),
+    "in_family": ("narrow",),
     "against": ("main", 1234567),
     "history": ("bench.jsonl",),
     "threads": (1,),
