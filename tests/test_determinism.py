@@ -1,4 +1,4 @@
-"""The same seed gives the same search: to the byte in another process, to a tolerance with another number of threads."""
+"""The same seed gives the same search: to the byte in another process, to a tolerance with other threads."""
 
 import csv
 import os
