@@ -145,12 +145,12 @@ def test_offset_axes_are_the_same_geometry(folder, capsys, plane):
         (["OWN", "doffs_px=null"], "doffs_px = None: expected a number"),
         (["OWN", "doffs_px=[]"], "doffs_px = []: expected a number"),
         (["OWN", "doffs_px=1e9"], "doffs_px = 1000000000.0: expected a number of pixels within"),
-        (["OWN", "gaze_px=5"], "gaze_px = 5: expected [column, row]"),
+        (["OWN", "gaze_px=5"], "gaze_px = 5: expected a list"),
         (["OWN", "gaze_px=[5]"], "gaze_px = [5]: expected [column, row]"),
-        (["OWN", "gaze_px=[5,a]"], "gaze_px = [5, 'a']: expected [column, row]"),
+        (["OWN", "gaze_px=[5,a]"], "gaze_px = [5, 'a']: expected a list"),
         (["OWN", "gaze_px=[500,5]"], "gaze_px = [500, 5]: expected [column, row]"),
-        (["OWN", "left=1"], "left = 1: expected a file's name"),
-        (["OWN", "disparity=0"], "disparity = 0: expected a file's name"),
+        (["OWN", "left=1"], "left = 1: expected a word or null"),
+        (["OWN", "disparity=0"], "disparity = 0: expected a word or null"),
     ],
 )
 def test_a_mistake_is_one_line_and_leaves_nothing(folder, capsys, plane, overrides, line):

@@ -26,6 +26,7 @@ __all__ = ["Kinds", "check_groups", "check_kinds", "kinds_of"]
 # Examples of what the files leave null, or to other settings, wherever it stands
 EXAMPLES: dict[str, tuple[Any, ...]] = {
     "pair": (None, "motorcycle"),
+    "matcher.source": ("disparity.npy",),
     "study": ("honesty",),
     "viewer": ("page",),
     "families": ("narrow", ["narrow"]),
