@@ -411,7 +411,7 @@ def test_simulated_scenes(folder, capsys):
         (["scenes=0"], "scenes = 0: expected at least 1, real=true or pairs"),
         (["pairs=art"], "pairs = art: expected a list"),
         (["scenes=0", "pairs=[nowhere]"], "pairs[0] = nowhere: expected motorcycle, or a folder"),
-        (["scenes=0", "pairs=[3]"], "pairs = [3]: expected a list, each of it a word"),
+        (["scenes=0", "pairs=[3]"], "pairs = [3]: expected a list, each of it text"),
         (["fovs_deg=[90, 60]"], "fovs_deg = [90, 60]: expected ascending numbers"),
         (["real=maybe"], "real = maybe: expected true or false"),
         (["looks=0"], "looks = 0"),

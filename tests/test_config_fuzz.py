@@ -67,7 +67,7 @@ FREE = {
 }  # fmt: skip
 # options that need what only a user has
 NEEDS = {"external", "trained", "correspondences", "onnx", "onnx_foundation_stereo", "onnx_igev", "onnx_raft_stereo",
-         "onnx_s2m2", "nearest_to"}  # fmt: skip
+         "onnx_s2m2", "nearest_to", "every_pixel"}  # fmt: skip
 
 
 class Begun(BaseException):

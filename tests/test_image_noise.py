@@ -70,7 +70,7 @@ def test_it_is_a_setting_on_by_default(tmp_path, capsys):
         ("noise.photons=0", "noise.photons = 0"),
         ("noise.read=-1", "noise.read = -1"),
         ("noise.exposure=nan", "noise.exposure = nan"),
-        ("noise=3", "noise = 3: expected photons, read and exposure"),
+        ("noise=3", "noise = 3: expected a mapping or null"),
     ):
         assert main(["search", "episodes=1", "saccades=1", settings, f"hydra.run.dir={tmp_path}/run"]) == 1
         assert named in capsys.readouterr().err

@@ -163,7 +163,7 @@ def test_the_command_senses_a_raw_pair(room, files, capsys):
         (["calibration_unit_m=0"], "calibration_unit_m = 0: expected metres"),
         (["gaze_right_px=left"], "gaze_right_px = left: expected [column, row], a pixel of the 260x260 images, or"),
         (["gaze_right_px=[1,900]"], "gaze_right_px = [1, 900]: expected [column, row]"),
-        (["calibration=3"], "calibration = 3: expected a file's name"),
+        (["calibration=3"], "calibration = 3: expected text or null"),
         (["left=right.png", "right=left.png", "calibration_unit_m=-1"], "calibration_unit_m = -1"),
         (["sensor=every_pixel", "matcher=sgbm"], "sensor.layout = every_pixel: expected a retina"),
     ],

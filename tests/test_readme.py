@@ -112,9 +112,9 @@ def test_the_readme_finds_the_nearest_object(tmp_path, monkeypatch, capsys):
     ((_, _, example),) = [block for block in blocks("README.md") if block[0] == "python"]
     names: dict = {}
     exec(compile(example, "README.md", "exec"), names)
-    assert "is nearest; in truth" in capsys.readouterr().out
+    assert "is surely nearest; in truth" in capsys.readouterr().out
     step, world = names["step"], names["world"]
-    assert (step.points.mean[step.cell] - world.scene.nearest_point_e).norm() < 0.15
+    assert (step.points.mean[names["sure"]] - world.scene.nearest_point_e).norm() < 0.15
 
 
 def test_the_readme_is_read_in_three_minutes():

@@ -158,7 +158,7 @@ def test_memories_that_do_not_fit_are_refused_before_the_work(folder, capsys):
     search(capsys, *alike, "memory.save=patches.npz")
     for setting, message in (
         ("memory.load=none.npz", "memory.load = none.npz: expected a memory"),
-        ("memory.load=3", "memory.load = 3: expected a word or null"),
+        ("memory.load=3", "memory.load = 3: expected text or null"),
         ("memory.save=memory.pt", "memory.save = memory.pt: expected a name that ends in .npz"),
         ("memory.save=away/memory.npz", "memory.save = away/memory.npz: expected a name"),
         ("memory.load=patches.npz fusion=aligned prior=cartesian", "fusion.chart = cartesian: expected inverse_range"),

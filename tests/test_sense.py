@@ -149,8 +149,8 @@ def test_offset_axes_are_the_same_geometry(folder, capsys, plane):
         (["OWN", "gaze_px=[5]"], "gaze_px = [5]: expected [column, row]"),
         (["OWN", "gaze_px=[5,a]"], "gaze_px = [5, 'a']: expected a list"),
         (["OWN", "gaze_px=[500,5]"], "gaze_px = [500, 5]: expected [column, row]"),
-        (["OWN", "left=1"], "left = 1: expected a word or null"),
-        (["OWN", "disparity=0"], "disparity = 0: expected a word or null"),
+        (["OWN", "left=1"], "left = 1: expected text or null"),
+        (["OWN", "disparity=0"], "disparity = 0: expected text or null"),
     ],
 )
 def test_a_mistake_is_one_line_and_leaves_nothing(folder, capsys, plane, overrides, line):

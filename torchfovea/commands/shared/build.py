@@ -67,7 +67,8 @@ REACH_RANGE_M = 1.0
 
 def build_sensor(cfg: DictConfig) -> tuple[Camera, Retina]:
     """The eyes' camera, in retinal pixels, and their retina."""
-    name_of(cfg, "sensor", "layout")
+    every = name_of(cfg, "sensor", "layout") == "every_pixel"
+    require(not every, "sensor.layout", "every_pixel", "a retina; every pixel is for sense alone")
     made = build_named(cfg, "sensor", "a layout of receptive fields", SENSOR, "layout")
     # what a source names is a function without arguments that makes the layout
     retina = check_retina(made() if OmegaConf.select(cfg, "sensor.source") is not None else made, "sensor")

@@ -96,7 +96,7 @@ EXAMPLES: dict[str, tuple[Any, ...]] = {
 }
 # may be left out as a whole
 OPTIONAL = ("noise",)
-WORDS = {"bool": "true or false", "int": "a whole number", "float": "a number", "str": "a word", "map": "a mapping"}
+WORDS = {"bool": "true or false", "int": "a whole number", "float": "a number", "str": "text", "map": "a mapping"}
 
 
 class Kinds(NamedTuple):

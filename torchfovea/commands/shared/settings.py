@@ -64,7 +64,7 @@ def typed(value: Any, kind: str, setting: str) -> Any:
         kind not in ("bool", "str") or type(value).__name__ == kind,
         setting,
         value,
-        {"bool": "true or false"}.get(kind, "a word"),
+        {"bool": "true or false"}.get(kind, "text"),
     )
     return value
 
