@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import yaml
 
 SENSOR = ["sensor.receptive_fields=2000", "sensor.source_px=200"]
 SEARCH = [*SENSOR, "memory.cells=300", "saccades=4", "episodes=3", "seed=5"]
@@ -33,7 +34,19 @@ TUNE = [
     "heldout_scenes=32",
 ]
 # Not of the figures: how long it took, and on what
-TIMES = ("seconds", "manifest.json", "config_hash", "settings_hash", "versions", "times", ".log", ".hydra", "cpu")
+TIMES = (
+    "seconds",
+    "manifest.json",
+    "config_hash",
+    "settings_hash",
+    "versions",
+    "times",
+    "per_second",
+    "per_cpu_second",
+    ".log",
+    ".hydra",
+    "cpu",
+)
 PICTURES = (".png", ".gif", ".html", ".svg")
 
 
@@ -144,7 +157,7 @@ def apart(one: Path, other: Path) -> tuple[float, int]:
 
 def differing(left: Any, right: Any) -> float:
     """How far two columns are apart."""
-    if left == right if not isinstance(left, np.ndarray) else np.array_equal(left, right, equal_nan=True):
+    if np.array_equal(left, right) if isinstance(left, np.ndarray) else left == right:
         return 0.0
     try:
         a, b = (np.asarray(value, dtype=np.float64) for value in (left, right))
@@ -166,6 +179,8 @@ def columns_of(path: Path) -> Iterator[tuple[str, Any]]:
             yield name, [float("nan") if v == "" else float(v) for v in column] if numeric(column) else column
     elif path.suffix == ".json":
         yield from flat(json.loads(path.read_text(encoding="utf-8")), path.stem)
+    elif path.suffix == ".yaml":
+        yield from flat(yaml.safe_load(path.read_text(encoding="utf-8")), path.stem)
     elif path.suffix == ".npz":
         with np.load(path) as arrays:
             yield from ((name, arrays[name]) for name in sorted(arrays.files))
@@ -182,7 +197,7 @@ def numeric(column: list[str]) -> bool:
 
 
 def flat(node: Any, name: str) -> Iterator[tuple[str, Any]]:
-    """The leaves of a JSON file."""
+    """The leaves of a JSON or YAML file."""
     if isinstance(node, dict | list):
         for key, value in node.items() if isinstance(node, dict) else enumerate(node):
             yield from flat(value, f"{name}.{key}")
