@@ -53,7 +53,8 @@ WRONG = {
 # numbers that may be below 0
 SIGNED = {
     "head.eyes_forward_m", "head.eyes_up_m", "head.ego_height_m", "eligibility.ground_z_m", "matcher.left_right_px",
-    "matcher.correlation", "scene.margin_m",
+    "matcher.correlation", "scene.margin_m", "acquisition.by_time", "acquisition.by_unseen", "acquisition.improvement",
+    "acquisition.information", "acquisition.doubt", "acquisition.cost_per_deg",
 }  # fmt: skip
 # what a command shares with others, and does not read: (command, setting)
 UNREAD = {(command, "seed") for command in ("sense", "benchmark", "doctor", "collect")}
@@ -170,6 +171,9 @@ def wrong_ones(command, name, value):
     for text in WRONG[type(value)]:
         fine = text == "-1" and (name in SIGNED or (command, name) in UNREAD)
         fine |= text in ("-1", "abc") and name.startswith(("profiles.quick.", "profiles.paper."))
+        # what only its readers judge, what a fit noted, no entry of one's own and no mixture beside a topology
+        fine |= name in FREE or name.startswith("budget.made_for.")
+        fine |= text == "null" and name in ("mine", "memory.weights", "memory.means", "memory.covariances")
         if not fine and not (text == "abc" and name in OWN_NAMES):
             yield f"{name}={text}"
 

@@ -464,7 +464,7 @@ def test_a_million_cells(generator):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: Fusion("average"), "fusion = average: expected one of"),
+        (lambda: Fusion("average"), "fusion.name = average: expected one of"),
         (lambda: Fusion(gate_deg=-1), "fusion.gate_deg = -1"),
         (lambda: Fusion(conflict=0), "fusion.conflict = 0"),
         (lambda: Fusion(window=0.5), "fusion.window = 0.5"),

@@ -98,7 +98,7 @@ def test_same_seed_same_run_and_explicit_settings_beat_the_profile(folder, capsy
         (["motor=magic"], "motor = magic: expected one of external, instant, physics"),
         (["head.baseline_m=0"], "head.baseline_m = 0"),
         (["prior.std=0"], "prior.std = 0"),
-        (["fusion.name=mean"], "fusion = mean"),
+        (["fusion.name=mean"], "fusion.name = mean"),
         (["matcher.block_px=4"], "matcher.block_px = 4"),
         (["far_m=0.1"], "far_m = 0.1"),
         (["memory.weights=[0]"], "weights = "),

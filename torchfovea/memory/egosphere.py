@@ -132,7 +132,7 @@ class Fusion:
     def __post_init__(self) -> None:
         """Raise SettingError for an unknown name or a size out of range."""
         names = ("inverse_range", "aligned", "printed")
-        require(self.name in names, "fusion", self.name, "one of " + ", ".join(names))
+        require(self.name in names, "fusion.name", self.name, "one of " + ", ".join(names))
         for name in ("gate_deg", "gate_spacing"):
             require(0 <= getattr(self, name) <= 1e6, f"fusion.{name}", getattr(self, name), "0 to 1e6")
         require(isinstance(self.fill, bool), "fusion.fill", self.fill, "true or false")
