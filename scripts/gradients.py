@@ -97,9 +97,11 @@ if __name__ == "__main__":
     parser.add_argument("kept", type=Path, help="folder of what the seeds came to")
     parser.add_argument("--ways", default="bias", help="some of " + ",".join(WAYS))
     parser.add_argument("--seeds", type=int, default=5, help="how many")
+    parser.add_argument("--first", type=int, default=0, help="the first of them")
     parser.add_argument("--only", type=int, help="this one alone")
     parser.add_argument("settings", nargs="*", help="of torchfovea tune")
     given = parser.parse_args()
     ways = given.ways.split(",")
     require(set(ways) <= set(WAYS), "ways", given.ways, "some of " + ",".join(WAYS))
-    compare(given.kept, given.settings, ways, list(range(given.seeds)) if given.only is None else [given.only])
+    seeds = range(given.first, given.first + given.seeds) if given.only is None else [given.only]
+    compare(given.kept, given.settings, ways, list(seeds))

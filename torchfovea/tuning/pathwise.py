@@ -57,7 +57,8 @@ def pathwise(problem: Problem, vector: Tensor, batch: Batch, alpha_share: float 
     """Back-propagate one smoothed episode a scene.
 
     Components are drawn, so that a mixture's weights get no gradient; α's comes from a hard common-random-number
-    difference, as for the others.
+    difference, as for the others. Where no soft fixation is worth more than the first gaze, as among many small
+    look-alikes, the derivative is 0.
     """
     task, n = problem.task, len(batch.scenes.nearest_m)
     x = vector.detach().to(problem.dtype).requires_grad_()
@@ -85,7 +86,6 @@ def pathwise(problem: Problem, vector: Tensor, batch: Batch, alpha_share: float 
     reward = -(1 - floor) / rho - floor * task.far_m
     value = _soft_episode(problem, batch, world, reward, Weighting(torch.as_tensor(bias.weights.alpha).detach()))
     slope = torch.autograd.grad(value.mean(), x)[0].double()
-    slope = torch.where(torch.isfinite(slope), slope, torch.zeros_like(slope))
     plain = prepare(problem, problem.bias(vector.detach(), batch.scenes), batch)
     slope[problem.shape.policy], spent, _ = policy_difference(problem, vector, batch, plain, alpha_share)
     return Gradient(slope, float(value.detach().mean()), n + spent, n + round(spent))
