@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchfovea.sensing.head import Head, fixate
+from torchfovea.sensing.head import Head, can_fixate
 from torchfovea.setting import require
 from torchfovea.tuning.bias import Bias
 
@@ -19,7 +19,7 @@ _FEWEST_ACCEPTED = 1e-3
 
 def reachable(head: Head, directions: Tensor) -> Tensor:
     """Whether the head can fixate points at 1 m in these directions, (..., 3) to bool (...)."""
-    return fixate(head, REACH_RANGE_M * directions)[1]
+    return can_fixate(head, REACH_RANGE_M * directions)
 
 
 def draw_cells(

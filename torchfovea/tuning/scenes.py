@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.gaussian import columns
-from torchfovea.sensing.head import Head, fixate
+from torchfovea.sensing.head import Head, can_fixate
 from torchfovea.setting import require, require_name
 
 __all__ = ["Distribution", "Hits", "Scenes", "draw_scenes", "first_surfaces", "nearest_point", "stream"]
@@ -264,7 +264,7 @@ def _misfits(d: Distribution, head: Head, can: Tensor, walls: tuple[float, ...])
     fits = (x + gap < front) & (x - gap > -back) & (y.abs() + gap < side) & (low >= floor) & (high + _GAP_M < ceiling)
     point = nearest_point(x, y, low, high, radius)
     far = point.norm(dim=-1)
-    fits &= fixate(head, point)[1] & (far >= _NEAREST_M)
+    fits &= can_fixate(head, point) & (far >= _NEAREST_M)
     fits[:, 0] &= point[:, 0, 2] - floor >= _LOWEST_M
     fits[:, 1:] &= far[:, 1:] >= far[:, :1] + d.margin_m
     apart = torch.hypot(x[:, :, None] - x[:, None], y[:, :, None] - y[:, None])

@@ -14,7 +14,7 @@ from torchfovea.deciding.strategies import inverse_range_acuity
 from torchfovea.deciding.weighted import Terms, Weighting, saccades_left, weighted_score
 from torchfovea.metrics import gap
 from torchfovea.sensing.camera import Pinhole
-from torchfovea.sensing.head import Gaze, cyclopean, eyes, fixate
+from torchfovea.sensing.head import Gaze, can_fixate, cyclopean, eyes, fixate
 from torchfovea.setting import require
 from torchfovea.tuning.scenes import Scenes, first_surfaces
 from torchfovea.tuning.worlds import Known, Task, Worlds, empty, look
@@ -97,7 +97,7 @@ def score(
         reward = range_from_inverse_range(reward)
     range_m = 1 / mean.clamp(min=1 / _FAR_M)
     point = world.direction * range_m[..., None]
-    reachable = fixate(observer.head, point)[1]
+    reachable = can_fixate(observer.head, point)
     limits = observer.eligibility
     # to first order, a range of 1/ρ along a direction is unsure by σ/ρ²
     height = point[..., 2] + observer.head.ego_height_m
