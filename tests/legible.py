@@ -33,9 +33,19 @@ def faults(figure) -> list[str]:
         found += [*_names(axes), *_colours(axes)]
     scale = WIDTH_PX / (72 * figure.get_figwidth())
     texts = [text for text in figure.findobj(lambda artist: hasattr(artist, "get_fontsize")) if text.get_text().strip()]
+    found += _on_each_other(figure)
     small = {scale * text.get_fontsize(): text.get_text() for text in texts if text.get_visible()}
     found += [f"'{text}': {size:.1f} px high at {WIDTH_PX}" for size, text in small.items() if size < LEAST_PX]
     return found
+
+
+def _on_each_other(figure) -> list[str]:
+    """Titles and names of axes that are written over each other."""
+    texts = [axes.title for axes in figure.axes]
+    texts += [axis.label for axes in figure.axes if axes.axison for axis in axes._axis_map.values()]
+    boxes = [(text.get_text(), text.get_window_extent()) for text in texts if text.get_text().strip()]
+    pairs = combinations(boxes, 2)
+    return [f"'{one}' is written over '{other}'" for (one, a), (other, b) in pairs if a.overlaps(b)]
 
 
 def _names(axes: Axes) -> list[str]:

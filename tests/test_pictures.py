@@ -2,14 +2,19 @@
 
 import numpy as np
 import pytest
-from legible import faults
+from legible import faults as faults_of_drawn
 from matplotlib.figure import Figure
 
 from torchfovea.commands.shared.pictures import PALETTE
 
 
+def faults(made):
+    made.draw_without_rendering()
+    return faults_of_drawn(made)
+
+
 def figure(width=12.0):
-    made = Figure(figsize=(width, 6))
+    made = Figure(figsize=(width, 6), layout="constrained")
     axes = made.subplots()
     axes.set(xlabel="distance [m]", ylabel="share of errors")
     return made, axes
@@ -53,6 +58,11 @@ def tiny(axes):
     axes.set_title("tiny", fontsize=5)
 
 
+def heaped(axes):
+    axes.figure.set_layout_engine("none")
+    axes.figure.add_axes(axes.get_position()).set(xlabel="time [s]", ylabel="gap")
+
+
 @pytest.mark.parametrize(
     ("harm", "line"),
     [
@@ -63,6 +73,7 @@ def tiny(axes):
         (red_and_green, "apart to some eyes"),
         (bare_bar, "a colour bar of"),
         (tiny, "'tiny': 6.9 px high"),
+        (heaped, "is written over"),
     ],
 )
 def test_a_fault_is_seen(harm, line):
@@ -83,12 +94,13 @@ def test_a_wide_picture_is_shown_small():
 
 
 def test_axes_in_space_and_shared_axes():
-    made = Figure(figsize=(12, 6))
-    space = made.add_subplot(1, 2, 1, projection="3d")
+    made = Figure(figsize=(12, 6), layout="constrained")
+    space = made.add_subplot(2, 2, 1, projection="3d")
     space.set(xlabel="x [m]", ylabel="y [m]")
     assert [fault for fault in faults(made) if fault.startswith("z of")]
     space.set_zlabel("z [m]")
-    left, right = made.subplots(1, 2, sharey=True)
+    left = made.add_subplot(2, 2, 3)
+    right = made.add_subplot(2, 2, 4, sharey=left)
     for axes in (left, right):
         axes.set_xlabel("time [s]")
     left.set_ylabel("gap")

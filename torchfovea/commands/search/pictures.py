@@ -121,6 +121,7 @@ def draw_outside(figure: Figure | SubFigure, place: int, episode: Episode, scene
     axes.set_box_aspect((2, 2, 1), zoom=1.35)
     axes.view_init(elev=30, azim=-130)
     axes.set(xlabel="ahead [m]", ylabel="left [m]", zlabel="up [m]")
+    axes.zaxis.labelpad = 0  # layouts do not see what stands beside axes in space
     axes.set_title("from outside: cells, gaze, target (gold)")
 
 

@@ -69,7 +69,7 @@ def sphere_map(
     axes.set(xlabel="azimuth [°] (left is positive)", ylabel="elevation [°]")
     axes.invert_xaxis()
     axes.set_aspect("equal")
-    axes.figure.colorbar(drawn, ax=axes, label=label, pad=0.015)
+    axes.figure.colorbar(drawn, ax=axes, label=label, location="bottom", aspect=30, pad=0.02)
     return drawn
 
 
