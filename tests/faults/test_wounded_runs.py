@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import random
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -91,7 +92,7 @@ def finished(folder):
 
 @pytest.fixture(scope="module")
 def whole(surgery, tmp_path_factory):
-    """A command's undisturbed run: what it found, and how long it took."""
+    """A command's undisturbed run: what it found, how long it took, and its folder."""
     kept = {}
 
     def run(name):
@@ -99,7 +100,7 @@ def whole(surgery, tmp_path_factory):
             folder = tmp_path_factory.mktemp("whole") / name
             (done,) = surgery({"arguments": command(name, folder)})
             assert done["status"] == 0, done["said"]
-            kept[name] = content(folder), done["seconds"]
+            kept[name] = content(folder), done["seconds"], folder
         return kept[name]
 
     return run
@@ -107,7 +108,7 @@ def whole(surgery, tmp_path_factory):
 
 @pytest.mark.parametrize("name", COMMANDS if LONG else ["sweep", "tune", "reproduce"])
 def test_a_killed_run_goes_on_to_the_same_end(surgery, whole, tmp_path, name, inject, faults):
-    expected, seconds = whole(name)
+    expected, seconds, _ = whole(name)
     source, folder, killed, before = random.Random(name), tmp_path / "run", 0, {}
     for k in range(faults):
         (done,) = surgery({"arguments": command(name, folder), "kill_after_s": source.uniform(0.05, 0.95) * seconds})
@@ -128,7 +129,7 @@ def test_a_killed_run_goes_on_to_the_same_end(surgery, whole, tmp_path, name, in
 
 @pytest.mark.parametrize("name", ["search", "tune", "reproduce"] if LONG else ["search"])
 def test_a_full_disk_is_named_and_nothing_is_lost(surgery, whole, tmp_path, name, inject, faults):
-    expected, _ = whole(name)
+    expected, *_ = whole(name)
     source, folder = random.Random(name), tmp_path / "run"
     for _ in range(faults):
         (done,) = surgery({"arguments": command(name, folder), "file_bytes": source.choice((0, 300, 1000, 3000))})
@@ -144,12 +145,38 @@ def test_a_full_disk_is_named_and_nothing_is_lost(surgery, whole, tmp_path, name
 
 @pytest.mark.parametrize("name", ["search", "sweep", "tune"] if LONG else ["search"])
 def test_two_in_one_folder_leave_what_one_would(surgery, whole, tmp_path, name, inject):
-    expected, _ = whole(name)
+    expected, *_ = whole(name)
     run = {"arguments": command(name, tmp_path / "run")}
     done = surgery(run, run)
     assert [one["status"] for one in done] == [0, 0], done
     assert content(tmp_path / "run") == expected
     inject("meetings in one folder")
+
+
+@pytest.mark.parametrize("name", COMMANDS if LONG else ["tune"])
+def test_a_changed_digit_is_named_or_made_again(surgery, whole, tmp_path, name, inject, faults):
+    """In whatever of a finished run is data; its manifests too."""
+    expected, _, made = whole(name)
+    source, folder = random.Random(name), tmp_path / "run"
+    shutil.copytree(made, folder)
+    data = [path for path in sorted(folder.rglob("*")) if path.suffix in (".csv", ".json", ".yaml")]
+    data = [path for path in data if path.parent.name != ".hydra"]  # what Hydra would have written, and nobody reads
+    for _ in range(3 * faults):
+        path = source.choice(data)
+        before = path.read_text()
+        at = source.choice([k for k, letter in enumerate(before) if letter.isdigit()])
+        path.write_text(before[:at] + str((int(before[at]) + source.randrange(1, 10)) % 10) + before[at + 1 :])
+        (done,) = surgery({"arguments": command(name, folder)})
+        where = str(path.relative_to(folder)), before[max(at - 40, 0) : at + 40], done["said"]
+        if done["status"] == 0:
+            assert content(folder) == expected, where
+        else:
+            named = path.name in done["said"] or "made with other settings" in done["said"]
+            assert named and "Traceback" not in done["said"], where
+        path.write_text(before)
+        inject("changed digits")
+    (done,) = surgery({"arguments": command(name, folder)})
+    assert done["status"] == 0 and content(folder) == expected, done["said"]
 
 
 def test_a_folder_that_cannot_be_written_is_named(surgery, inject):

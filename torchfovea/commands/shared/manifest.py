@@ -30,6 +30,8 @@ __all__ = [
 ]
 
 MANIFEST = "manifest.json"
+# what holds figures, and is read again
+DATA = (".csv", ".json", ".yaml")
 # what does not change a run's figures
 INCIDENTAL = ("workers", "backend", "device", "batch", "picture", "trust")
 
@@ -92,32 +94,36 @@ def finished(cfg: DictConfig, folder: Path, score: str = "gap_per_saccade") -> f
 
 
 def complete(folder: Path, figures: Mapping[str, Any]) -> None:
-    """Write result.json, which says that a run is complete; before it, what it and the tables hold, into the manifest.
+    """Write result.json, which says that a run is complete; before it, what it and the data hold, into the manifest.
 
-    A later change of a single digit is noticed by `unchanged`.
+    A later change of a single digit is noticed by `unchanged`. Data are tables, JSON and YAML, wherever they lie in the
+    folder; what is only looked at, pictures, films and logs, is anybody's to remove.
     """
-    sums = {path.name: _sum(path.read_bytes()) for path in sorted(folder.glob("*.csv"))}
-    sums["result.json"] = _sum(json_text(figures).encode())
-    write_json(folder / MANIFEST, {**_read_manifest(folder / MANIFEST), "sha256": sums})
+    told = {key: value for key, value in _read_manifest(folder / MANIFEST).items() if key != "sha256"}
+    sums = {name: _sum((folder / name).read_bytes()) for name in _data(folder)}
+    sums |= {MANIFEST: _sum(json_text(told).encode()), "result.json": _sum(json_text(figures).encode())}
+    write_json(folder / MANIFEST, {**told, "sha256": sums})
     write_result(folder, figures)
 
 
 def unchanged(folder: Path) -> None:
-    """Compare a complete run's result and tables with what its manifest says was written.
+    """Compare a complete run's result, data and settings with what its manifest says was written.
 
     Raises:
         SettingError: for the first that is another; it names the file.
     """
-    sums = _read_manifest(folder / MANIFEST).get("sha256", {})
+    told = _read_manifest(folder / MANIFEST)
+    sums = told.pop("sha256", {})
     require(isinstance(sums, dict), f"{folder / MANIFEST}: sha256", sums, "the sums of files")
     for name, written in sums.items():
         try:
             path = path_within(folder, name)
         except Damaged as error:
             raise SettingError(f"{folder / MANIFEST}: {name}: expected a file of the run ({error})") from None
-        found = _sum(path.read_bytes()) if path.is_file() else None
-        state = "missing" if found is None else "changed"
-        require(found == written, str(path), state, f"what was written; remove {folder / 'result.json'} to run again")
+        content = json_text(told).encode() if name == MANIFEST else path.read_bytes() if path.is_file() else None
+        state = "missing" if content is None else "changed"
+        whole = content is not None and _sum(content) == written
+        require(whole, str(path), state, f"what was written; remove {folder / 'result.json'} to run again")
 
 
 def write_kept(path: Path, content: Any) -> None:
@@ -139,6 +145,13 @@ def read_kept(path: Path) -> Any:
     if not whole:
         raise SettingError(f"{path} = corrupt: expected what was written; remove it to make it again")
     return part["content"]
+
+
+def _data(folder: Path) -> list[str]:
+    """The files of a run that hold figures, as paths in its folder; not what is about the run, or unfinished."""
+    inside = [path.relative_to(folder) for path in sorted(folder.rglob("*")) if path.suffix in DATA and path.is_file()]
+    hidden = [any(part.startswith(".") for part in path.parts) for path in inside]
+    return [p.as_posix() for p, h in zip(inside, hidden, strict=True) if not h and p.name != MANIFEST]
 
 
 def _sum(content: bytes) -> str:
