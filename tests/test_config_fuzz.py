@@ -34,7 +34,7 @@ from omegaconf.errors import OmegaConfBaseException
 from torchfovea import cli
 from torchfovea.commands import doctor
 from torchfovea.commands.shared.config import conf_dir
-from torchfovea.commands.shared.kinds import kinds_of
+from torchfovea.commands.shared.kinds import BESIDES, kinds_of
 from torchfovea.commands.table import COMMANDS
 
 OVERRIDES = int(os.environ.get("FUZZ_OVERRIDES", "12"))  # of each command; 0: all
@@ -248,3 +248,8 @@ def test_every_setting_has_a_kind(command):
     kinds = kinds_of(command)
     unknown = {name for name, kind in kinds.items() if not kind.names - {"null"} and name not in FREE}
     assert not {name for name in unknown if not name.startswith("budget.made_for.")}
+
+
+def test_what_is_told_besides_belongs_to_a_setting():
+    named = {name for names in BESIDES.values() for name in names.split()}
+    assert named <= {name for command in COMMANDS for name in kinds_of(command)}

@@ -21,81 +21,30 @@ from torchfovea.commands.shared.config import conf_dir
 from torchfovea.commands.shared.settings import is_whole
 from torchfovea.setting import SettingError
 
-__all__ = ["Kinds", "check_groups", "check_kinds", "kinds_of"]
+__all__ = ["BESIDES", "Kinds", "check_groups", "check_kinds", "kinds_of"]
 
-# Examples of what the files leave null, or to other settings, wherever it stands
-EXAMPLES: dict[str, tuple[Any, ...]] = {
-    "pair": (None, "motorcycle"),
-    "matcher.source": ("disparity.npy",),
-    "study": ("honesty",),
-    "viewer": ("page",),
-    "families": ("narrow", ["narrow"]),
-    "paths": ("step", ["step"]),
-    "tracks": ("policy",),
-    "report": ("folder", ["folder"]),
-    "conditions": ("all",),
-    "arms": ("all",),
-    "size": ("quick",),
-    "resume": ("checkpoint.pt",),
-    "recording": ("folder",),
-    "left": ("left.png",),
-    "right": ("right.png",),
-    "mask": ("mask.png",),
-    "disparity": ("disparity.pfm",),
-    "calibration": ("stereo.yml",),
-    "calibration_right": ("right.yml",),
-    "calibration_lens": ("brown_conrady",),
-    "calibration_cameras": ([2, 3],),
-    "calibration_unit_m": (0.001,),
-    "focal_px": (1.0,),
-    "cx_px": (1.0,),
-    "cy_px": (1.0,),
-    "baseline_m": (1.0,),
-    "gaze_px": ([1.0, 1.0],),
-    "gaze_right_px": ([1.0, 1.0], "same"),
-    "disparity_unit_px": (1.0,),
-    "disparity_unknown": (1.0,),
-    "bag.camera": (None,),
-    "bag.joints": ("/joints",),
-    "bag.odometry": ("/odom",),
-    "bag.pan": ("pan",),
-    "bag.tilt": ("tilt",),
-    "bag.vergence": ("vergence",),
-    "memory.cells": (1,),
-    "memory.load": ("memory.npz",),
-    "memory.save": ("memory.npz",),
-    "memory.resample": ("remembered",),
-    "memory.topology": ("geodesic",),
-    "stop.probability": (0.05,),
-    "sensor.grid": ([1, 1],),
-    "sensor.sample": (None, 8000),
-    "fovs_deg": ([90.0],),
-    "pairs": (["motorcycle"],),
-    "mine": (None, [{}]),
-    "entries": (None,),
-    "overrides": (["head=human"],),
-    "scene_overrides.attention_world": (["head=human"],),
-    "distances": (5,),
-    "vergences": (5,),
-    "propagation.samples": (5,),
-    "realised.source_px": ([200],),
-    "every": (1,),
-    "acquisition.saccades": (10,),
-    "in_family": ("narrow",),
-    "against": ("main", 1234567),
-    "history": ("bench.jsonl",),
-    "threads": (1,),
-    "seconds": (1.0,),
-    "episodes": (1,),
-    "scenes": (1,),
-    "judged_scenes": (1,),
-    "looks": (1,),
-    "validation_scenes": (1,),
-    "heldout_scenes": (1,),
-    "check_episodes": (1,),
+# what a setting may be besides what the files give it, where they give it null or leave it to other settings
+BESIDES = {
+    "null": "noise pair bag.camera sensor.sample mine entries",
+    "int": (
+        "memory.cells sensor.sample distances vergences propagation.samples every acquisition.saccades "
+        "against threads episodes scenes judged_scenes looks validation_scenes heldout_scenes check_episodes"
+    ),
+    "float": (
+        "calibration_unit_m focal_px cx_px cy_px baseline_m disparity_unit_px disparity_unknown "
+        "stop.probability seconds"
+    ),
+    "str": (
+        "pair matcher.source study viewer families paths tracks report conditions arms size resume recording "
+        "left right mask disparity calibration calibration_right calibration_lens gaze_right_px bag.joints "
+        "bag.odometry bag.pan bag.tilt bag.vergence memory.load memory.save memory.resample memory.topology "
+        "in_family against history"
+    ),
+    "list[int]": "calibration_cameras sensor.grid realised.source_px",
+    "list[float]": "gaze_px gaze_right_px fovs_deg",
+    "list[str]": "families paths report pairs overrides scene_overrides.attention_world",
+    "list[map]": "mine",
 }
-# may be left out as a whole
-OPTIONAL = ("noise",)
 WORDS = {"bool": "true or false", "int": "a whole number", "float": "a number", "str": "text", "map": "a mapping"}
 
 
@@ -170,9 +119,10 @@ def kinds_of(command: str) -> dict[str, Kinds]:
         assert isinstance(node, dict)
         own = {str(key): value for key, value in node.items() if key not in ("defaults", "hydra")}
         _note(found, own if whole else {path.parent.name: own}, "")
-    for name, examples in EXAMPLES.items():
-        for example in examples if name in found else ():
-            found[name] = _joined(found[name], _told(example))
+    for kind, names in BESIDES.items():
+        for name in names.split():
+            if name in found:
+                found[name] = _joined(found[name], _named(kind))
     return found
 
 
@@ -199,10 +149,14 @@ def _note(found: dict[str, Kinds], node: dict[str, Any], prefix: str) -> None:
     for key, value in node.items():
         name = f"{prefix}{key}"
         found[name] = _joined(found.get(name), _told(value))
-        if name in OPTIONAL:
-            found[name] = _joined(found[name], _told(None))
         if isinstance(value, dict):
             _note(found, value, f"{name}.")
+
+
+def _named(kind: str) -> Kinds:
+    """Of "int", "list[int]", ..."""
+    name, _, element = kind.removesuffix("]").partition("[")
+    return Kinds(frozenset([name]), _named(element) if element else None)
 
 
 def _told(value: Any) -> Kinds:
