@@ -100,6 +100,16 @@ def test_a_reader_that_leaves_early_is_no_error(arguments, tmp_path):
     assert (done.returncode, done.stderr) == (1, "")
 
 
+@pytest.mark.skipif(os.name != "posix", reason="shells are POSIX")
+@pytest.mark.parametrize("closed", [">&-", "2>&-", ">&- 2>&-"])
+def test_a_command_whose_streams_are_closed_ends_as_ever(closed, tmp_path):
+    command = f"exec {sys.executable} -m torchfovea --version {closed}"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(["sh", "-c", command], capture_output=True, cwd=tmp_path, env=environment, timeout=240)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_flags_may_stand_anywhere_and_unknown_ones_are_named(job, capsys):
     job("return float(cfg.seed)")
     assert main(["doctor", "probe_timeout_s=2", "-m", "seed=0,1"]) == 0

@@ -41,7 +41,7 @@ def test_one_bad_direction_among_good_ones_is_refused():
 def test_whole_numbers_are_no_directions_of_cells():
     """Unit vectors along the axes pass for directions; found by scripts/fuzz.sh in `resample`."""
     axes = torch.eye(3, dtype=torch.int64)
-    with pytest.raises(SettingError, match=r"cells.dtype = torch.int64: expected a floating-point type"):
+    with pytest.raises(SettingError, match=r"cells.dtype = torch.int64: expected torch.float32 or torch.float64"):
         empty_memory(axes, Prior())
     with pytest.raises(SettingError, match=r"cells.dtype"):
         tf.resample(empty_memory(CELLS, Prior()), axes, Fusion())

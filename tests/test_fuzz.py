@@ -7,6 +7,7 @@ warning (they are errors here), and whole batches of nothing stay nothing.
 
 import math
 import os
+import random
 from functools import cache
 
 import pytest
@@ -37,18 +38,17 @@ CELLS = tf.sample(tf.direction_mixture([1.0], [[0.0, 0.0, 0.0]], [[1.0, 1.0, 1.0
 
 
 class Numbers:
-    """Draws tensors; remembers whether all of them are finite, of an ordinary size and a usual type."""
+    """Draws tensors by `draw`, which picks one of many; remembers whether they are finite, of an ordinary size and a
+    usual type."""
 
-    def __init__(self, data):
-        self.data = data
-        self.dtype = data.draw(st.sampled_from(DTYPES))
-        self.batch = data.draw(st.sampled_from(BATCHES))
-        self.wild = data.draw(st.integers(0, 3)) == 0
+    def __init__(self, draw):
+        self.draw = draw
+        self.dtype, self.batch, self.wild = draw(DTYPES), draw(BATCHES), draw(range(4)) == 0
         self.ordinary = self.dtype in (torch.float32, torch.float64)
-        self.generator = torch.Generator().manual_seed(data.draw(st.integers(0, 2**32 - 1)))
+        self.generator = torch.Generator().manual_seed(draw(range(2**32)))
 
     def pick(self, *choices):
-        return self.data.draw(st.sampled_from(choices))
+        return self.draw(choices)
 
     def tensor(self, *shape, scale=None, middle=0.0):
         """(*batch, *shape) around a middle; now and then of another scale, with what is no number, or strided."""
@@ -70,6 +70,12 @@ class Numbers:
 
     def positive(self, *shape):
         return self.tensor(*shape).abs() + 1e-3
+
+    def cells(self, count):
+        """Directions, of unit length or not."""
+        directions = self.tensor(count, 3)
+        unit = self.pick(True, True, False) and directions.is_floating_point()
+        return torch.nn.functional.normalize(directions, dim=-1) if unit else directions
 
     def mask(self, *shape):
         return torch.rand((*self.batch, *shape), generator=self.generator) < 0.7
@@ -160,7 +166,7 @@ FUZZED = {
     "log_expected_improvement": lambda n: tf.log_expected_improvement(n.tensor(5), n.positive(5), n.tensor()),
     "motion": lambda n: tf.motion(torch.eye(3), n.tensor(3), n.pick(None, n.tensor(6, 6))),
     "move": lambda n: tf.move(memory(), tf.motion(torch.eye(3), torch.randn(3, generator=n.generator)), tf.Fusion()),
-    "new_memory": lambda n: tf.new_memory(OBSERVER, n.tensor(n.pick(4, 0), n.pick(3, 3, 2))),
+    "new_memory": lambda n: tf.new_memory(OBSERVER, n.pick(n.cells(n.pick(4, 0)), n.tensor(4, 2))),
     "observe": lambda n: tf.observe(
         n.matches(5), n.eyes(), n.pick(*CAMERAS), n.positive(5), chart=n.pick("inverse_range", "cartesian", "polar")
     ),
@@ -168,7 +174,7 @@ FUZZED = {
     "place_features": lambda n: tf.place_features(n.pick(*RETINAS), n.pick(3, 0, -1), dtype=n.pick(None, n.dtype)),
     "reconstruct": reconstruct,
     "remember": remember,
-    "resample": lambda n: tf.resample(memory(), n.tensor(6, 3), tf.Fusion()),
+    "resample": lambda n: tf.resample(memory(), n.cells(6), tf.Fusion()),
     "sample": lambda n: tf.sample(
         tf.direction_mixture([1.0], [[1.0, 0.0, 0.0]], [[0.1, 0.2, 0.3]]), n.pick(4, 0, -1), n.pick(n.generator, 3, -1)
     ),
@@ -207,7 +213,7 @@ def test_every_function_of_the_front_door_is_fuzzed():
 @settings(max_examples=EXAMPLES)
 @given(data=st.data())
 def test_a_promise_or_one_line(name, data):
-    numbers = Numbers(data)
+    numbers = Numbers(lambda choices: data.draw(st.sampled_from(choices)))
     try:
         found = FUZZED[name](numbers)
     except SettingError as error:
@@ -216,3 +222,26 @@ def test_a_promise_or_one_line(name, data):
     if numbers.ordinary:
         for leaf in leaves(found):
             assert not leaf.is_floating_point() or not leaf.isnan().any(), leaf
+
+
+@pytest.mark.parametrize("name", FUZZED)
+def test_mixed_precision_changes_nothing(name):
+    """What a user wraps around the whole loop for the sake of a network; the layer has its own test in test_layer."""
+
+    def answer(seed):
+        numbers = Numbers(random.Random(seed).choice)
+        numbers.dtype, numbers.wild = numbers.pick(torch.float32, torch.float64), False
+        return [*leaves(FUZZED[name](numbers))]
+
+    whole = 0
+    for seed in range(2 * EXAMPLES):
+        try:
+            found = answer(seed)
+        except SettingError:
+            continue
+        with torch.autocast("cpu", torch.bfloat16):
+            again = answer(seed)
+        whole += 1
+        for one, other in zip(found, again, strict=True):
+            torch.testing.assert_close(other, one, rtol=0, atol=0, equal_nan=True)
+    assert whole > 0

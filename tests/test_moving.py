@@ -198,6 +198,21 @@ def test_resampling_into_the_same_cells_changes_nothing():
     assert blank.looks.sum() == 0 and len(blank.cells) == 10
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_cells_that_are_drawn_anew_become_of_the_memorys_type(dtype):
+    memory = known_room(fibonacci_directions(60, torch.float64))
+    memory = memory._replace(**{k: v.to(dtype) for k, v in memory._asdict().items() if k in ("cells", *KNOWN)})
+    cells = fibonacci_directions(40, torch.float32)
+    after, same = (resample(memory, given, Fusion()) for given in (cells.double(), cells))
+    for one, other in zip(after[:5], same[:5], strict=True):
+        parts = zip(one, other, strict=True) if isinstance(one, tuple) else [(one, other)]
+        for a, b in parts:
+            torch.testing.assert_close(a, b, rtol=0, atol=0)
+    assert after.cells.dtype == dtype
+    with pytest.raises(SettingError, match=r"cells = \(2, 40, 3\): expected directions of one memory"):
+        resample(memory, cells.expand(2, 40, 3), Fusion())
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [

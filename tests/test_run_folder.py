@@ -145,6 +145,15 @@ def test_a_mistake_does_not_stand_in_the_way_of_its_correction(tmp_path, mistake
     assert search(tmp_path / "run") == 0
 
 
+def test_a_mistake_does_not_remove_the_folder_that_one_stands_in(tmp_path, monkeypatch, capsys):
+    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(tmp_path / "empty")
+    assert search(".", "saccades=0") == 1
+    assert (tmp_path / "empty").is_dir() and not list((tmp_path / "empty").iterdir())
+    assert search(tmp_path / "other", "saccades=0") == 1
+    assert not (tmp_path / "other").exists()
+
+
 def test_a_mistake_in_a_sweep_does_not_either(tmp_path):
     grid = ["search", "--multirun", *TINY, "seed=0,1", f"hydra.sweep.dir={tmp_path}/sweep"]
     assert main([*grid, "scene.room.height_m=nan"]) == 1

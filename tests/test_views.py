@@ -173,6 +173,9 @@ def test_an_eyes_camera_may_be_off_its_retinas_middle():
         assert [told.focal_px, told.cx_px, told.cy_px] == pytest.approx([asked.focal_px, asked.cx_px, asked.cy_px])
 
 
+CALIBRATED = Pinhole(30.0, 24.5, 19.5), Pinhole(30.0, 24.5, 19.5), verged(0.1, 0.1)
+
+
 def test_images_become_of_one_kind():
     left, right = torch.randint(0, 256, (3, 20, 30)).byte(), torch.rand(1, 20, 30, dtype=torch.float64)
     views = verged_views(left.numpy(), right, verged(0.1, 0.2), Pinhole(100.0), 100.0)
@@ -185,6 +188,22 @@ def test_images_become_of_one_kind():
     batch = torch.rand(4, 3, 20, 30)
     both = verged_views(batch, 1 - batch, verged(0.1, 0.2), Pinhole(100.0), 100.0).grey()
     torch.testing.assert_close(both[:4] + both[4:], torch.ones(8, 1, 20, 30)[:4])
+
+
+@pytest.mark.parametrize("half", [torch.float16, torch.bfloat16], ids=["float16", "bfloat16"])
+@pytest.mark.parametrize("params", [SGBM(), Sweep()], ids=["sgbm", "sweep"])
+def test_half_precision_is_that_of_the_pixels_alone(params, half):
+    """Nor does mixed precision around a matcher change what it finds."""
+    left = torch.rand(1, 40, 50, generator=torch.Generator().manual_seed(0)).to(half)
+    pair = left, left.roll(-3, -1)
+    find = lambda *pair: Matcher(params)(posed_views(*pair, *CALIBRATED), LogPolar(200, 20.0), Budget())[0]  # noqa: E731
+    expected = find(*(image.float() for image in pair))
+    with torch.autocast("cpu", half):
+        again = find(*(image.float() for image in pair))
+    assert expected.valid.double().mean() > 0.3
+    for found in (find(*pair), again):
+        for one, other in zip(found, expected, strict=True):
+            torch.testing.assert_close(one, other, rtol=0, atol=0)
 
 
 def test_gradients_reach_the_images():

@@ -34,6 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         The exit status: 0, 1 for a run that failed, 2 for an unknown command, 130 after Ctrl-C.
     """
+    _open_closed_streams()
     try:
         status = _dispatch(list(sys.argv[1:] if arguments is None else arguments) or ["--help"])
         sys.stdout.flush()
@@ -45,6 +46,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # The reader of our output has gone; leave nothing for the interpreter to flush at its exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+
+
+def _open_closed_streams() -> None:
+    """Where nobody listens (``>&-``) what is said goes nowhere, rather than into whatever file is opened next."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))
 
 
 def _dispatch(arguments: list[str]) -> int:
@@ -230,8 +238,11 @@ def _remove_bare(folder: Path, name: str) -> bool:
     bare = {entry.name for entry in folder.iterdir()} <= {".hydra", f"{name}.log", MANIFEST}
     if bare:
         _close_logs()
-        shutil.rmtree(folder, ignore_errors=True)
+        for entry in folder.iterdir():
+            shutil.rmtree(entry, ignore_errors=True) if entry.is_dir() else entry.unlink(missing_ok=True)
         with suppress(OSError):  # not empty
+            if not Path.cwd().is_relative_to(folder.resolve()):  # nobody wants the ground pulled from under his feet
+                folder.rmdir()
             for parent in takewhile(lambda above: above.is_relative_to(Path.cwd() / "outputs"), folder.parents):
                 parent.rmdir()
     return bare

@@ -23,6 +23,7 @@ from torchfovea.memory.egosphere import Fusion, Memory, Prior, check_chart, empt
 from torchfovea.memory.encoders import encoder_covariance
 from torchfovea.memory.update import Common, remember
 from torchfovea.memory.voting import against, within_sight
+from torchfovea.rounding import unrounded
 from torchfovea.sensing.camera import Camera, Pinhole
 from torchfovea.sensing.correspondence import Budget, Correspondences
 from torchfovea.sensing.head import Eyes, Gaze, Head, Kinematics, cyclopean, fixate
@@ -166,6 +167,7 @@ def check_owner(observer: Observer, memory: Memory) -> None:
     require(asked in (0, known), "classes", asked, f"{known}, the classes of the memory")
 
 
+@unrounded
 def perceive(
     observer: Observer, memory: Memory, matches: Correspondences, eyes: Eyes, common: Common | None = None
 ) -> Memory:
@@ -216,6 +218,7 @@ def _sought(observer: Observer) -> int | None:
     return None if observer.classes is None else observer.classes.sought
 
 
+@unrounded
 def decide(
     observer: Observer,
     memory: Memory,

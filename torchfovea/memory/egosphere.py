@@ -184,7 +184,7 @@ def empty_memory(cells: Tensor, prior: Prior, chart: str = "inverse_range") -> M
     require(chart in ("inverse_range", "cartesian"), "chart", chart, "inverse_range or cartesian")
     require(cells.dim() >= 2 and cells.shape[-1] == 3, "cells", tuple(cells.shape), "a shape (..., cells, 3)")
     require(cells.numel() > 0, "memory.cells", cells.shape[-2], "at least 1")
-    require(cells.is_floating_point(), "cells.dtype", cells.dtype, "a floating-point type")
+    require(cells.dtype in (torch.float32, torch.float64), "cells.dtype", cells.dtype, "torch.float32 or torch.float64")
     unit = bool(((cells * cells).sum(-1) - 1).abs().max() < 1e-3)
     require(unit, "cells", "directions", "finite unit vectors")
     zero = torch.zeros_like(cells[..., 0])

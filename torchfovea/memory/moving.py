@@ -22,16 +22,10 @@ from torchfovea.gaussian import (
     quadratic3,
     rotate3,
 )
-from torchfovea.memory.association import gather_columns, in_front
-from torchfovea.memory.egosphere import (
-    Fusion,
-    Memory,
-    belief,
-    check_chart,
-    empty_memory,
-    prior_information,
-)
+from torchfovea.memory.association import in_front
+from torchfovea.memory.egosphere import Fusion, Memory, belief, check_chart, empty_memory, prior_information
 from torchfovea.memory.nearest import nearest_cell, nearest_observation
+from torchfovea.rounding import unrounded
 from torchfovea.sensing.chart import basis
 from torchfovea.setting import require
 
@@ -164,6 +158,7 @@ def _carry(memory: Memory, step: Motion) -> _Moved:
     return _Moved(Gaussian(state.mean[good], state.cov[good]), *rows)
 
 
+@unrounded
 def move(memory: Memory, step: Motion, fusion: Fusion) -> Memory:
     """Carry one memory along with the base.
 
@@ -258,6 +253,7 @@ def _write(old: Tensor, rows: Tensor, values: Tensor) -> Tensor:
     return new
 
 
+@unrounded
 def resample(memory: Memory, cells: Tensor, fusion: Fusion) -> Memory:
     """Carry what is known over to another set of cells, conserving information (Sec. 8).
 
@@ -281,6 +277,8 @@ def resample(memory: Memory, cells: Tensor, fusion: Fusion) -> Memory:
     check_chart(memory, fusion.chart, "fusion.chart")
     require(memory.cells.dim() == 2, "cells", tuple(memory.cells.shape), "one memory, a shape (cells, 3)")
     chart, prior, spacing_rad = memory.chart, memory.prior, memory.spacing_rad
+    require(cells.dim() == 2, "cells", tuple(cells.shape), "directions of one memory, a shape (cells, 3)")
+    cells = cells.to(memory.cells.dtype) if cells.dtype in (torch.float32, torch.float64) else cells
     empty = empty_memory(cells, prior, chart)._replace(axis=memory.axis)
     old = (memory.looks > 0).nonzero().squeeze(1)
     if len(old) == 0:
@@ -307,11 +305,11 @@ def resample(memory: Memory, cells: Tensor, fusion: Fusion) -> Memory:
     sums = [vector, matrix, (memory.bearing - bearing).double()[source][:, None]]
     parts = torch.cat([*sums, memory.lasting.double()[source], memory.votes.double()[source]], -1) * share[:, None]
     parts[:, 11] *= share  # the second sum of `lasting` is of squares
-    total = torch.zeros(len(cells), 14, dtype=parts.dtype, device=cells.device).index_add(0, target, parts)
-    total = columns(*total.unbind(-1))
+    total = columns(*parts.new_zeros(len(cells), 14).index_add(0, target, parts).unbind(-1))
     information = Information(empty.information.vector + total[..., :3], empty.information.matrix + total[..., 3:9])
     total = total.to(cells.dtype)
-    looks = empty.looks.scatter_reduce(0, target, gather_columns(memory.looks[:, None], source)[:, 0], "amax")
+    looks = empty.looks.scatter_reduce(0, target, memory.looks[source], "amax")
     lasting, votes = columns(*total[..., 10:12].unbind(-1)), columns(*total[..., 12:].unbind(-1))
-    bearing = empty.bearing + total[..., 9]
-    return empty._replace(information=information, bearing=bearing, looks=looks, lasting=lasting, votes=votes)
+    return empty._replace(
+        information=information, bearing=empty.bearing + total[..., 9], looks=looks, lasting=lasting, votes=votes
+    )

@@ -26,6 +26,7 @@ from torchfovea.memory.topology import (
     reachable_directions,
     truncated_icosahedron_directions,
 )
+from torchfovea.rounding import unrounded
 from torchfovea.setting import SettingError, require
 
 __all__ = [
@@ -146,6 +147,7 @@ def _numbers(name: str, value: Any, dtype: torch.dtype | None, device: torch.dev
     return tensor
 
 
+@unrounded
 def log_density(mixture: DirectionMixture, directions: Tensor) -> Tensor:
     """Log density of directions on the unit sphere, per steradian.
 
@@ -250,6 +252,7 @@ def sphere_quadrature(
     return Quadrature(directions, directions.new_full((len(directions),), 4 * math.pi / n))
 
 
+@unrounded
 def sample(
     mixture: DirectionMixture, n: int, generator: torch.Generator | int, reachable: Reachable | None = None
 ) -> Tensor:
@@ -290,14 +293,11 @@ def sample(
         kept.append((component[good], noise[good]))
         accepted += len(kept[-1][0])
         proposed += count
-        require(
-            proposed < 1 << 17 or accepted >= _FEWEST_ACCEPTED * proposed,
-            "reachable",
-            f"{accepted} of {proposed} directions drawn from the memory's bias",
-            f"at least one in {1 / _FEWEST_ACCEPTED:.0f}: the bias and the reachable set do not overlap",
-        )
-    component = torch.cat([c for c, _ in kept])[:n]
-    noise = torch.cat([e for _, e in kept])[:n]
+        enough = proposed < 1 << 17 or accepted >= _FEWEST_ACCEPTED * proposed
+        drawn = f"{accepted} of {proposed} directions drawn from the memory's bias"
+        expected = f"at least one in {1 / _FEWEST_ACCEPTED:.0f}: the bias and the reachable set do not overlap"
+        require(enough, "reachable", drawn, expected)
+    component, noise = (torch.cat(parts)[:n] for parts in zip(*kept, strict=True))
     return _unit(mixture.means[component] + (mixture.cholesky[component] @ noise.unsqueeze(-1)).squeeze(-1))
 
 

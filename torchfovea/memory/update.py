@@ -20,6 +20,7 @@ from torchfovea.memory.classes import join_evidence
 from torchfovea.memory.egosphere import Fusion, Memory, Prior, blend, check_chart, forget
 from torchfovea.memory.pooling import Pooled, add_common, found_points, nearness, pool, pool_patches, share_errors
 from torchfovea.memory.voting import cast, see
+from torchfovea.rounding import unrounded
 from torchfovea.sensing.chart import turn_cartesian
 from torchfovea.sensing.kinship import Kinship
 from torchfovea.sensing.triangulation import Observations
@@ -50,6 +51,7 @@ def fuse(memory: Memory, pooled: Pooled, lasting: Tensor | None = None) -> Memor
     )
 
 
+@unrounded
 def remember(
     memory: Memory,
     observed: Observations,

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchfovea.rounding import unrounded
 from torchfovea.sensing.kinematics import Eyes, Gaze, Kinematics, axes_meet, rig_frame, to_ego
 from torchfovea.setting import require
 
@@ -126,6 +127,7 @@ def cyclopean(head: Head | Kinematics, gaze: Gaze) -> tuple[Tensor, Tensor]:
     return rotation, head.eyes_forward_m * rotation[..., 2] - head.eyes_up_m * rotation[..., 1]
 
 
+@unrounded
 def eyes(head: Head | Kinematics, gaze: Gaze) -> Eyes:
     """Forward kinematics: the poses of both cameras in E (the left eye turns +θ/2 about the optical y, the right −θ/2).
 

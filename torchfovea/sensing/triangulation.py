@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchfovea.compiling import is_compiling
 from torchfovea.gaussian import columns, definiteness
+from torchfovea.rounding import unrounded
 from torchfovea.sensing.camera import Camera, Pinhole
 from torchfovea.sensing.chart import Components, bilinear_moments, in_tangent_frame
 from torchfovea.sensing.correspondence import Correspondences
@@ -146,6 +147,7 @@ class _Rig(NamedTuple):
     right_camera: Camera
 
 
+@unrounded
 def observe(
     matches: Correspondences,
     eyes: Eyes,

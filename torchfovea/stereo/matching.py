@@ -12,6 +12,7 @@ import math
 import torch
 from torch import Tensor
 
+from torchfovea.rounding import unrounded
 from torchfovea.sensing.correspondence import Budget, Correspondences, Disparity
 from torchfovea.sensing.retina import Retina
 from torchfovea.stereo.exposure import alike
@@ -24,6 +25,7 @@ from torchfovea.stereo.visibility import undisputed
 __all__ = ["match_sgbm"]
 
 
+@unrounded
 def match_sgbm(
     views: Views,
     retina: Retina | None,

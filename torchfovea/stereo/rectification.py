@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.gaussian import columns
+from torchfovea.rounding import unrounded
 from torchfovea.sensing.camera import Camera, Pinhole
 from torchfovea.sensing.head import to_ego
 from torchfovea.sensing.retina import Retina, interpolate
@@ -113,6 +114,7 @@ def image_frame(views: Views, retina: Retina | None) -> RectifiedPair:
     return RectifiedPair(views, retina, views.camera_left, (height, width))
 
 
+@unrounded
 def frame_to_match(
     views: Views, retina: Retina | None, nearest_m: float, fov_deg: float, search: tuple[int, int]
 ) -> RectifiedPair:
@@ -140,6 +142,7 @@ def frame_to_match(
     return RectifiedPair(views, retina, camera, (height, before + width + after), limit)
 
 
+@unrounded
 def frame_to_show(views: Views, retina: Retina | None, fov_deg: float) -> RectifiedPair:
     """What the left eye sees, to be shown to somebody else's matcher; arguments as of `frame_to_match`.
 

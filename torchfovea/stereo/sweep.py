@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.gaussian import columns
+from torchfovea.rounding import unrounded
 from torchfovea.sensing.correspondence import Budget, Clues, Correspondences, eye_sigma_px, inlier_share
 from torchfovea.sensing.kinship import lasting_share
 from torchfovea.sensing.layout import Retina
@@ -68,6 +69,7 @@ class Volume(NamedTuple):
     most: Tensor
 
 
+@unrounded
 def match_sweep(
     views: Views,
     retina: Retina | None,

@@ -138,7 +138,8 @@ def verged_views(
     """The images of two eyes, whose retinas look at their middles and span their shorter side.
 
     Args:
-        left: (1 or 3, H, W) in [0, 1], or uint8; or a batch (B, 1 or 3, H, W).
+        left: (1 or 3, H, W) in [0, 1], or uint8; or a batch (B, 1 or 3, H, W). Half precision becomes float32, of which
+            correspondences are.
         right: the same size.
         rig: the eyes' poses (`torchfovea.stereo.rig`); a batch may have (B, 3, 3) rotations.
         camera: the left eye's, or both eyes', in retinal pixels.
@@ -243,6 +244,7 @@ def _image(name: str, image: Tensor | np.ndarray) -> Tensor:
     if pixels.dtype == torch.uint8:
         pixels = pixels.to(torch.get_default_dtype()) / 255
     require(pixels.is_floating_point(), f"{name}.dtype", pixels.dtype, "floating point in [0, 1], or uint8")
+    pixels = pixels if pixels.dtype == torch.float64 else pixels.float()
     low, high = (float(end) for end in pixels.detach().aminmax())  # NaN if there is any
     require(math.isfinite(low) and math.isfinite(high), name, "NaN or infinite values", "finite values")
     require(low >= -1e-3 and high <= 1 + 1e-3, name, f"{low:g} to {high:g}", "values in [0, 1]")
