@@ -19,7 +19,23 @@ from torchfovea.sensing.retina import Retina, interpolate
 from torchfovea.setting import require
 from torchfovea.stereo.views import Views
 
-__all__ = ["RectifiedPair", "frame_to_match", "frame_to_show", "image_frame"]
+__all__ = ["Part", "RectifiedPair", "frame_to_match", "frame_to_show", "image_frame"]
+
+
+class Part(NamedTuple):
+    """A rectangle of rectified views, as pixels that are each so many of theirs wide.
+
+    Attributes:
+        left: its first column [view px].
+        top: its first row [view px].
+        size: height and width, in its own pixels.
+        step: side of one of its pixels [view px].
+    """
+
+    left: int
+    top: int
+    size: tuple[int, int]
+    step: int = 1
 
 
 class RectifiedPair(NamedTuple):
@@ -40,6 +56,13 @@ class RectifiedPair(NamedTuple):
     size: tuple[int, int]
     limit: float = math.inf
     looks: Tensor | None = None
+
+    def room(self, part: Part, rows: int, before: int, after: int) -> tuple[int, int, int, int]:
+        """How many of a part's pixels there are above, below, before and after it in the views, at most so many."""
+        height, width = (-(-side // part.step) for side in self.size)
+        top, left = part.top // part.step, part.left // part.step
+        below, right = height - top - part.size[0], width - left - part.size[1]
+        return min(top, rows), min(below, rows), min(left, before), min(right, after)
 
     def place(self, px: Tensor) -> tuple[Tensor, Tensor]:
         """Where the left view shows places (..., 2) of the left eye [retinal px], and whether it does: bool (...)."""
@@ -71,10 +94,19 @@ class RectifiedPair(NamedTuple):
             seen = camera.in_view(rays) & views.holds(there, retina, right=True)
         return there, seen if retina is None else seen & retina.inside(there)
 
-    def seen(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Where both eyes see the views' pixels, (H, W, 2) [retinal px], and where they are before the left: bool."""
+    def seen(self, like: Tensor, part: Part | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Where both eyes see pixels, (H, W, 2) [retinal px], and where they are before the left: bool.
+
+        Args:
+            like: of the result's device and type.
+            part: whose pixels; None: the views'.
+        """
         views, retina = self.views, self.retina
-        row, column = (torch.arange(n, device=like.device, dtype=like.dtype) for n in self.size)
+        part = part or Part(0, 0, self.size)
+        row, column = (
+            torch.arange(n, device=like.device, dtype=like.dtype) * part.step + (first + (part.step - 1) / 2)
+            for n, first in zip(part.size, (part.top, part.left), strict=True)
+        )
         px = columns(*torch.broadcast_tensors(column, row[:, None]))
         if views.rectified:
             place = (px - px.new_tensor(views.origin_px(retina))) / views.scale(retina)

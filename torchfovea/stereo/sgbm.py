@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import ClassVar
 
@@ -41,6 +41,8 @@ class SGBM:
         texture: mean horizontal gradient [grey levels of 255 per px] over the block below which nothing can be matched.
         rectified_fov_deg: widest rectified view; what lies beyond is masked.
         edge_px: neighbouring disparities further apart than this are different surfaces, never averaged.
+        half_from_px: receptive fields at least this wide [image px] are matched on views of half the size, with half
+            the block; None: none are.
     """
 
     block_px: int = 5
@@ -57,6 +59,7 @@ class SGBM:
     texture: float = 0.1
     rectified_fov_deg: float = 140.0
     edge_px: float = 1.0
+    half_from_px: float | None = None
 
     authors: ClassVar[SGBM]
 
@@ -85,6 +88,8 @@ class SGBM:
         fov = self.rectified_fov_deg
         require(0 < fov <= 160, "matcher.rectified_fov_deg", fov, "more than 0 and at most 160 degrees")
         require(self.edge_px > 0, "matcher.edge_px", self.edge_px, "a positive number of pixels")
+        wide = self.half_from_px is None or self.half_from_px > 0
+        require(wide, "matcher.half_from_px", self.half_from_px, "a positive number of pixels, or null")
 
     @property
     def penalties(self) -> tuple[int, int]:
@@ -92,6 +97,22 @@ class SGBM:
         square = self.block_px**2
         small = 8 * square if self.smooth_small is None else self.smooth_small
         return small, 32 * square if self.smooth_large is None else self.smooth_large
+
+    def halved(self) -> SGBM:
+        """The same on pictures of half the size, in their pixels."""
+        block = self.block_px // 4 * 2 + 1
+        small, large = (max(1, round(penalty * (block / self.block_px) ** 2)) for penalty in self.penalties)
+        return replace(
+            self,
+            block_px=block,
+            smooth_small=small,
+            smooth_large=max(large, small + 1),
+            left_right_px=-(-self.left_right_px // 2),
+            speckle_px=-(-self.speckle_px // 4),
+            speckle_range_px=-(-self.speckle_range_px // 2),
+            first_disparity_px=None if self.first_disparity_px is None else self.first_disparity_px // 2,
+            disparities=None if self.disparities is None else 16 * math.ceil(self.disparities / 32),
+        )
 
     def search(self, low_px: float, high_px: float) -> tuple[int, int]:
         """The first disparity searched and one past the last, for a scene between `low_px` and `high_px`."""
@@ -141,7 +162,7 @@ def check_room(size: tuple[int, int], search: tuple[int, int], params: SGBM, mos
 
 
 def disparity_sgbm(
-    left: np.ndarray, right: np.ndarray, search: tuple[int, int], params: SGBM, pad: bool = True
+    left: np.ndarray, right: np.ndarray, search: tuple[int, int], params: SGBM, pad: tuple[int, int] | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Disparity of every pixel of the left image.
 
@@ -166,9 +187,9 @@ def disparity_sgbm(
     window = params.block_px + 4
     textured = cv2.blur(gradient, (window, window)) > params.texture
     left, right = (np.rint(image.clip(0, 1) * 255).astype(np.uint8) for image in (left, right))
-    before, after = (max(end, 0), max(-first, 0)) if pad else (0, 0)
+    before, after = (max(end, 0), max(-first, 0)) if pad is None else pad
     width = left.shape[1]
-    if pad:
+    if before or after:
         left, right = (cv2.copyMakeBorder(image, 0, 0, before, after, cv2.BORDER_REPLICATE) for image in (left, right))
     # on narrower images OpenCV reads beyond its buffers (opencv#25828)
     if min(left.shape) <= params.block_px or left.shape[1] <= max(end, 0) + max(-first, 0) + params.block_px:

@@ -24,7 +24,7 @@ CLEAR = 1.5  # a winner's misfit is less by this factor; else both may stay
 
 @torch.no_grad()
 def outdone(
-    cell: Tensor, shape: tuple[int, int], disparity: Tensor, misfit: Tensor, valid: Tensor
+    cell: Tensor, shape: tuple[int, int], disparity: Tensor, misfit: Tensor, valid: Tensor, step: int = 1
 ) -> tuple[Tensor, Tensor]:
     """Which claims on places of the right eye are outdone by others.
 
@@ -34,6 +34,7 @@ def outdone(
         disparity: (B, N), in cells.
         misfit: (B, N), how much the neighbourhoods differ.
         valid: bool (B, N), whether the claim counts.
+        step: side of a cell [px]; over larger ones misfits are surer and less apart is apart.
 
     Returns:
         bool (B, N); and by how much the farthest rival's disparity differs, outdone or not, (B, N) in cells, 0: none.
@@ -54,14 +55,14 @@ def outdone(
     for k in range(-NEAR, NEAR + 1):
         there = index + k
         differs = told.gather(1, there).sub_(disparity).abs_()
-        rival = differs > APART + abs(k)
-        out |= rival & (least.gather(1, there).mul_(CLEAR) < misfit)
+        rival = differs > APART / step + abs(k)
+        out |= rival & (least.gather(1, there).mul_(CLEAR ** (1 / step)) < misfit)
         dispute = torch.where(rival & (differs > dispute), differs, dispute)
     return out & valid, torch.where(valid, dispute, torch.zeros_like(dispute))
 
 
 @torch.no_grad()
-def undisputed(left: Tensor, right: Tensor, disparity: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+def undisputed(left: Tensor, right: Tensor, disparity: Tensor, valid: Tensor, step: int = 1) -> tuple[Tensor, Tensor]:
     """Where the disparities of a rectified pair are not outdone by others, bool (H, W); and disputes (H, W) [px].
 
     Args:
@@ -69,6 +70,7 @@ def undisputed(left: Tensor, right: Tensor, disparity: Tensor, valid: Tensor) ->
         right: (H, W).
         disparity: (H, W) [px].
         valid: bool (H, W).
+        step: see `outdone`.
     """
     height, width = left.shape
     x = torch.arange(width, device=left.device, dtype=left.dtype)
@@ -89,7 +91,7 @@ def undisputed(left: Tensor, right: Tensor, disparity: Tensor, valid: Tensor) ->
     shift = disparity.flatten()[claims]
     cell = torch.stack([(claims % width - shift).round().long(), claims // width], -1)
     every = torch.ones_like(claims, dtype=torch.bool)
-    lost, dispute = outdone(cell[None], (height, width), shift[None], misfit.flatten()[claims][None], every[None])
+    lost, dispute = outdone(cell[None], (height, width), shift[None], misfit.flatten()[claims][None], every[None], step)
     kept, rivals = (torch.zeros_like(a).flatten() for a in (valid, disparity))
     kept[claims], rivals[claims] = ~lost[0], dispute[0]
     return kept.reshape(height, width), rivals.reshape(height, width)
