@@ -12,6 +12,7 @@ import math
 from functools import lru_cache
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torchfovea.gaussian import columns
@@ -43,22 +44,18 @@ def read_clues(disparity: Disparity, place: Tensor, shift: Tensor, width_px: Ten
         that; the gap is that radius times the share of places without. What is hidden is the map's rivals.
     """
     height, width = disparity.disparity.shape
-    values, valid = disparity.disparity.flatten(), disparity.valid.flatten()
+    # NaN where there is no disparity, and around the map
+    told = F.pad(torch.where(disparity.valid, disparity.disparity, math.nan), (1, 1, 1, 1), value=math.nan).flatten()
     radius = (width_px.square() + BLOCK_PX**2).sqrt()
     x, y = place.unbind(-1)
-
-    def at(angle: float) -> tuple[Tensor, Tensor]:
-        column, row = (x + radius * math.cos(angle)).round(), (y + radius * math.sin(angle)).round()
-        on = (column >= 0) & (column <= width - 1) & (row >= 0) & (row <= height - 1)
-        index = row.clamp(0, height - 1).long() * width + column.clamp(0, width - 1).long()
-        return values[index], valid[index] & on
-
-    nearer, farther, holes = (torch.zeros_like(shift) for _ in range(3))
-    for k in range(DIRECTIONS // 2):
-        (one, one_there), (other, other_there) = (at(math.tau * (k / DIRECTIONS + half)) for half in (0.0, 0.5))
-        departs = torch.where(one_there & other_there, shift - (one + other) / 2, torch.zeros_like(shift))
-        nearer, farther = torch.maximum(nearer, departs), torch.maximum(farther, -departs)
-        holes = holes + (~one_there).to(holes) + (~other_there).to(holes)
+    angle = math.tau * torch.arange(DIRECTIONS, device=radius.device, dtype=radius.dtype)[:, None] / DIRECTIONS
+    column = torch.addcmul(x, radius, angle.cos()).round_().clamp_(-1, width).int()
+    row = torch.addcmul(y, radius, angle.sin()).round_().clamp_(-1, height).int()
+    around = told.index_select(0, ((row + 1) * (width + 2) + (column + 1)).flatten()).view(DIRECTIONS, -1)
+    one, other = around.chunk(2)
+    departs = (shift - (one + other) / 2).nan_to_num_(0.0)
+    nearer, farther = departs.amax(0).clamp(min=0), departs.amin(0).neg().clamp(min=0)
+    holes = around.isnan().sum(0)
     clues = Clues(torch.maximum(nearer, farther), radius * holes / DIRECTIONS, nearer)
     if disparity.rival_px is None:
         return clues

@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torchfovea.gaussian import columns
@@ -108,7 +109,9 @@ def read_map(
         return shift + doffs, found & shown
 
     left_px = _fields(field, retina)
-    shift, found = read(left_px)
+    place, shown = frame.place(left_px)
+    shift, found = read_values(field.disparity, field.valid, place, edge_px)
+    shift, found = shift + doffs, found & shown
     reading = None
     if retina is not None and pair is not None:
         reading = refine_reading(left_eye(pair, views, retina), read, shift, found, reach, edge_px, move)
@@ -116,12 +119,12 @@ def read_map(
     lowest = reach / range_m[1] if math.isfinite(range_m[1]) else -1.0  # noise may carry infinity to −1 px
     found &= (shift >= lowest) & (shift <= reach / range_m[0])
     shift = shift - doffs
-    right_px, seen = frame.there(left_px, shift)
+    right_px, seen = frame.there(left_px, place, shift)
     found &= seen
     if frame.looks is not None:
         field = field._replace(image=field.image * frame.looks, valid=field.valid & frame.looks)
     width_px = torch.ones_like(shift) if retina is None else retina.width_px(left_px) * scale
-    clues = read_clues(field, frame.place(left_px)[0], shift, width_px)
+    clues = read_clues(field, place, shift, width_px)
     if reading is not None:
         clues = clues._replace(noise_px=reading.noise_px, mismatch=reading.mismatch)
     return correspondences(left_px, right_px, found, retina, budget, clues), field._replace(clues=clues)
@@ -134,25 +137,23 @@ def read_values(values: Tensor, valid: Tensor, place: Tensor, edge_px: float) ->
     must be valid itself: nothing is averaged over a depth edge.
     """
     height, width = values.shape
-    x, y = place.unbind(-1)
-    column, row = x.round(), y.round()
-    on = (column >= 0) & (column <= width - 1) & (row >= 0) & (row <= height - 1)
-    zero = torch.zeros_like(x)
-    nearest = torch.where(on, row, zero).long() * width + torch.where(on, column, zero).long()
-    values, valid = values.flatten(), valid.flatten()
-    reference, found = values[nearest], on & valid[nearest]
+    # NaN, which is on no surface, where there is none and around the map
+    told = F.pad(torch.where(valid, values, math.nan), (1, 2, 1, 2), value=math.nan).flatten()
+    x, y = place[..., 0].clamp(-1, width), place[..., 1].clamp(-1, height)
     left, top = x.floor(), y.floor()
-    total, weighted = zero, zero
-    for dx in (0, 1):
-        for dy in (0, 1):
-            u, v = left + dx, top + dy
-            at = v.clamp(0, height - 1).long() * width + u.clamp(0, width - 1).long()
-            weight = (1 - (x - u).abs()).clamp(min=0) * (1 - (y - v).abs()).clamp(min=0)
-            weight = weight * (valid[at] & ((values[at] - reference).abs() <= edge_px))
-            total, weighted = total + weight, weighted + weight * values[at]
-    found = found & (total > 0)
-    value = weighted / torch.where(found, total, torch.ones_like(total))
-    return torch.where(found, value, torch.zeros_like(value)), found
+    first = (top.int() + 1) * (width + 3) + (left.int() + 1)
+    reference = told.index_select(0, first + (y.round() - top).int() * (width + 3) + (x.round() - left).int())
+    across, down = x - left, y - top
+    total, weighted = torch.zeros_like(x), torch.zeros_like(x)
+    for over, column in ((1 - across, 0), (across, 1)):
+        for under, row in ((1 - down, 0), (down, width + 3)):
+            value = told.index_select(0, first + (column + row))
+            near = (value - reference).abs_() <= edge_px
+            weight = over * under * near
+            total += weight
+            weighted.addcmul_(weight, torch.where(near, value, 0))
+    found = total > 0
+    return weighted / torch.where(found, total, 1), found
 
 
 def correspondences(

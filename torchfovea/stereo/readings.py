@@ -56,10 +56,12 @@ def refine_reading(
         move: whether to take the refined disparities, or only what the images say of those that were read.
     """
     shift, noise, mismatch = shift_px.clone(), torch.zeros_like(shift_px), torch.zeros_like(shift_px)
-    for sheet in sheets(eye.retina, 1 / eye.scale, shift_px.device, shift_px.dtype):
+    parts = sheets(eye.retina, 1 / eye.scale, shift_px.device, shift_px.dtype)
+    cells = [sheet.px.flatten(0, 1) for sheet in parts]
+    values = (told.split([len(own) for own in cells]) for told in read(torch.cat(cells)))
+    for sheet, there, trusted in zip(parts, *values, strict=True):
         ray = sheet_rays(eye, sheet.px)
         depth = sheet_depth(eye, sheet.px)[0]
-        there, trusted = read(sheet.px.flatten(0, -2))
         there, trusted = there.reshape(depth.shape), trusted.reshape(depth.shape)[None]
         edge = torch.full_like(depth, edge_px)[None]
         level = smoothed(there[None], edge, trusted)
@@ -68,8 +70,8 @@ def refine_reading(
         offset = subpixel(eye, sheet, level * step, width_px * step, trusted, Neighbourhood())
         value = torch.where(offset.value.abs() < 1, offset.value, torch.zeros_like(level))
         by = level - there + value * width_px
-        values = torch.stack([by, offset.variance.sqrt() * width_px, 1 - offset.correlation], 1)
-        (by, sigma, rest), told = (x[0] for x in read_sheet(sheet, values, there[None], trusted, edge))
+        refined = torch.stack([by, offset.variance.sqrt() * width_px, 1 - offset.correlation], 1)
+        (by, sigma, rest), told = (x[0] for x in read_sheet(sheet, refined, there[None], trusted, edge))
         told = told & found[sheet.rf]
         if move:
             shift[sheet.rf] += torch.where(told, by, torch.zeros_like(by))

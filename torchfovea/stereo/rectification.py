@@ -75,11 +75,12 @@ class RectifiedPair(NamedTuple):
         ahead = self.camera.in_view(directions)
         return self.camera.project(directions), ahead & (x.abs() <= self.limit * z) & (y.abs() <= self.limit * z)
 
-    def there(self, px: Tensor, shift_px: Tensor) -> tuple[Tensor, Tensor]:
+    def there(self, px: Tensor, place: Tensor, shift_px: Tensor) -> tuple[Tensor, Tensor]:
         """Where the right eye sees what the left one sees at places (N, 2), and whether it does: bool (N,).
 
         Args:
             px: [retinal px].
+            place: of these in the left view (N, 2), see `place`.
             shift_px: disparities (N,) [view px], without doffs.
         """
         views, retina = self.views, self.retina
@@ -87,7 +88,7 @@ class RectifiedPair(NamedTuple):
             there = columns(px[..., 0] - shift_px / views.scale(retina), px[..., 1])
             seen = views.holds(there, retina)
         else:
-            place, camera = self.place(px)[0], views.cameras(retina)[1]
+            camera = views.cameras(retina)[1]
             rays = self.camera.rays(columns(place[..., 0] - shift_px, place[..., 1]))
             rays = to_ego(views.rig.R_right.to(px).mT, rays)
             there = camera.project(rays)
