@@ -43,22 +43,41 @@ def outdone(
     column, row = cell.unbind(-1)
     valid = valid & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
     width = columns + 2 * NEAR
-    none = rows * width + NEAR
-    index = torch.where(valid, row * width + column + NEAR, none)
-    least = misfit.new_full((len(misfit), none + NEAR + 1), torch.inf)
-    least = least.scatter_reduce(1, index, torch.where(valid, misfit, torch.inf), "amin")
-    best = valid & (misfit == least.gather(1, index))
+    none, size = rows * width + NEAR, rows * width + 2 * NEAR + 1
+    every = torch.arange(len(valid), device=valid.device)[:, None] * size
+    index = (torch.where(valid, row * width + column + NEAR, none) + every).flatten()
+    shift, own = disparity.flatten(), torch.where(valid, misfit, torch.inf).flatten()
+    least = own.new_full((len(valid) * size,), torch.inf).scatter_reduce_(0, index, own, "amin")
+    best = valid.flatten() & (own == least.index_select(0, index))
     # nobody's disparity differs from nothing's
-    told = torch.full_like(least, torch.nan).scatter(1, torch.where(best, index, none), disparity)
-    told[:, none] = torch.nan
-    out, dispute = torch.zeros_like(valid), torch.zeros_like(disparity)
+    told = torch.full_like(least, torch.nan).scatter_(0, torch.where(best, index, none), shift)
+    told.view(-1, size)[:, none] = torch.nan
+    apart = APART / step
+    claims = _contested(told, index, shift, apart).nonzero()[:, 0]
+    index, shift, own = (part.index_select(0, claims) for part in (index, shift, own))
+    out, dispute = torch.zeros_like(claims, dtype=torch.bool), torch.zeros_like(shift)
     for k in range(-NEAR, NEAR + 1):
         there = index + k
-        differs = told.gather(1, there).sub_(disparity).abs_()
-        rival = differs > APART / step + abs(k)
-        out |= rival & (least.gather(1, there).mul_(CLEAR ** (1 / step)) < misfit)
+        differs = told.index_select(0, there).sub_(shift).abs_()
+        rival = differs > apart + abs(k)
+        out |= rival & (least.index_select(0, there).mul_(CLEAR ** (1 / step)) < own)
         dispute = torch.where(rival & (differs > dispute), differs, dispute)
-    return out & valid, torch.where(valid, dispute, torch.zeros_like(dispute))
+    lost, rivals = torch.zeros_like(valid).flatten(), torch.zeros_like(disparity).flatten()
+    lost[claims], rivals[claims] = out, dispute
+    return lost.view_as(valid), rivals.view_as(disparity)
+
+
+def _contested(told: Tensor, index: Tensor, disparity: Tensor, apart: float) -> Tensor:
+    """Which claims (M,) may have a rival near their cells, bool (M,): few, so that only they need a closer look."""
+    high, low = told.nan_to_num(-torch.inf), told.nan_to_num(torch.inf)
+    top, bottom = high.clone(), low.clone()
+    for k in range(1, NEAR + 1):
+        for here, there in ((slice(k, None), slice(None, -k)), (slice(None, -k), slice(k, None))):
+            torch.maximum(top[here], high[there] - k, out=top[here])
+            torch.minimum(bottom[here], low[there] + k, out=bottom[here])
+    slack = 0.9 * apart  # for rounding
+    top, bottom = (most.index_select(0, index) for most in (top, bottom))
+    return (top - disparity > slack) | (disparity - bottom > slack)
 
 
 @torch.no_grad()
@@ -78,23 +97,20 @@ def undisputed(left: Tensor, right: Tensor, disparity: Tensor, valid: Tensor, st
     first = there.floor().clamp(max=width - 2)
     part, first = there - first, first.long()
     like = torch.lerp(right.gather(1, first), right.gather(1, first + 1), part)
-    claims = valid.flatten().nonzero()[:, 0]
-    if claims.numel() < 2:
-        return valid, torch.zeros_like(disparity)
-    mine, theirs = left.flatten()[claims], like.flatten()[claims]
-    # exposures differ: one gain and offset
-    gain = mine.std() / theirs.std().clamp(min=1e-6)
-    square = ((left - mine.mean()) - gain * (like - theirs.mean())).square()
     weight = valid.to(left)
+    if valid.count_nonzero() < 2:
+        return valid, torch.zeros_like(disparity)
+    # exposures differ: one gain and offset
+    mine, theirs = ((image - (image * weight).sum() / weight.sum()) for image in (left, like))
+    gain = (mine.square() * weight).sum().sqrt() / (theirs.square() * weight).sum().sqrt().clamp(min=1e-6)
+    square = (mine - gain * theirs).square()
     misfit = average(torch.stack([square * weight, weight]), 1, False)
     misfit = misfit[0] / misfit[1].clamp(min=1e-6)
-    shift = disparity.flatten()[claims]
-    cell = torch.stack([(claims % width - shift).round().long(), claims // width], -1)
-    every = torch.ones_like(claims, dtype=torch.bool)
-    lost, dispute = outdone(cell[None], (height, width), shift[None], misfit.flatten()[claims][None], every[None], step)
-    kept, rivals = (torch.zeros_like(a).flatten() for a in (valid, disparity))
-    kept[claims], rivals[claims] = ~lost[0], dispute[0]
-    return kept.reshape(height, width), rivals.reshape(height, width)
+    row = torch.arange(height, device=left.device)[:, None].expand(-1, width)
+    cell = torch.stack([(x - disparity).round().long(), row], -1)
+    flat, share, claim = (part.view(1, -1) for part in (disparity, misfit, valid))
+    lost, rivals = outdone(cell.view(1, -1, 2), (height, width), flat, share, claim, step)
+    return valid & ~lost.view_as(valid), rivals.view_as(disparity)
 
 
 @torch.no_grad()
