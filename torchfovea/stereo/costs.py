@@ -6,6 +6,7 @@ Everything here is differentiable in the images, but for `inverse_depths`.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -116,29 +117,18 @@ def acuity(images: Tensor, retina: Retina, scale: float, middle: tuple[float, fl
         (B, L, H, W), about 0, up to the level of the widest RF. Differentiable.
     """
     height, width = images.shape[-2:]
-    x, y = (
-        (torch.arange(n, device=images.device, dtype=images.dtype) - m) / scale
-        for n, m in ((width, middle[0]), (height, middle[1]))
-    )
     images = images - 0.5  # sums of squares lose least about 0
-    place = columns(x, y[:, None])
-    own = _level(retina.width_px(place), scale)
-    rim = retina.width_px(place.new_tensor([retina.radius_px, 0.0]))
-    top = min(math.ceil(float(_level(rim, scale)) - 1e-3), int(math.log2(min(height, width))))
+    own, top = _levels(retina, scale, middle, (height, width), images.device, images.dtype)
     pyramid = [images]
     for _ in range(top):
         pyramid.append(halve(pyramid[-1]))
-    pixels = [torch.arange(n, device=images.device, dtype=images.dtype) for n in (width, height)]
 
     def shown(k: int) -> Tensor:
         """Level k of the pyramid, as large as the images."""
         if k == 0:
             return images
-        rows, across = pyramid[k].shape[-2:]
-        u, v = ((p + 0.5) * 0.5**k - 0.5 for p in pixels)
-        grid = columns(u * (2 / max(across - 1, 1)) - 1, v[:, None] * (2 / max(rows - 1, 1)) - 1)
-        grid = grid[None].expand(len(images), -1, -1, -1)
-        return F.grid_sample(pyramid[k], grid, padding_mode="border", align_corners=True)
+        large: Tensor = F.interpolate(pyramid[k], scale_factor=2**k, mode="bilinear", align_corners=False)
+        return large[..., :height, :width]
 
     # from the coarsest down, in place: at full size every image more that is held is one too many
     levels = images.new_empty(len(images), top + 1, height, width)
@@ -150,6 +140,26 @@ def acuity(images: Tensor, retina: Retina, scale: float, middle: tuple[float, fl
         )
         coarse = fine
     return levels
+
+
+@lru_cache(maxsize=2)
+def _levels(
+    retina: Retina,
+    scale: float,
+    middle: tuple[float, float],
+    size: tuple[int, int],
+    device: torch.device,
+    dtype: torch.dtype,
+) -> tuple[Tensor, int]:
+    """The level that shows what an RF at each pixel (H, W) would see, and that of the widest RF; see `acuity`."""
+    with torch.inference_mode(False), torch.no_grad():
+        x, y = (
+            (torch.arange(n, device=device, dtype=dtype) - m) / scale for n, m in zip(size[::-1], middle, strict=True)
+        )
+        place = columns(x, y[:, None])
+        rim = retina.width_px(place.new_tensor([retina.radius_px, 0.0]))
+        top = min(math.ceil(float(_level(rim, scale)) - 1e-3), int(math.log2(min(size))))
+        return _level(retina.width_px(place), scale), top
 
 
 def _level(width_px: Tensor, scale: float) -> Tensor:

@@ -108,12 +108,13 @@ class RectifiedPair(NamedTuple):
             torch.arange(n, device=like.device, dtype=like.dtype) * part.step + (first + (part.step - 1) / 2)
             for n, first in zip(part.size, (part.top, part.left), strict=True)
         )
-        px = columns(*torch.broadcast_tensors(column, row[:, None]))
         if views.rectified:
+            px = columns(column, row[:, None])
             place = (px - px.new_tensor(views.origin_px(retina))) / views.scale(retina)
             return place, place, torch.ones_like(px[..., 0], dtype=torch.bool)
-        rays = self.camera.rays(px)
-        turned = [to_ego(R.to(like).mT, rays) for R in views.rig[:2]]
+        x, y, z = self.camera.ray_components(column, row[:, None])
+        # a row and a column of them are added up: no more is done for every pixel
+        turned = [columns(*(x * a + z * c + y * b for a, b, c in R.to(like).mT)) for R in views.rig[:2]]
         left, right = (c.project(r) for c, r in zip(views.cameras(retina), turned, strict=True))
         return left, right, views.cameras(retina)[0].in_view(turned[0])
 
