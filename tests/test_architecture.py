@@ -18,7 +18,7 @@ ROOMS = {"sensing", "stereo", "memory", "deciding", "studies"}
 
 # From the ground up. A module imports from its own floor (never in a circle) or from those below it.
 FLOORS = (
-    ("setting", "files", "untrusted", "imported", "compiling", "finite", "rounding"),
+    ("setting", "files", "untrusted", "imported", "compiling", "finite", "rounding", "allocation"),
     ("gaussian",),
     (
         "camera",
@@ -46,6 +46,7 @@ FLOORS = (
         "sgbm",
         "semiglobal",
         "costs",
+        "acuity",
         "subpixel",
         "exposure",
         "sparse",

@@ -8,7 +8,8 @@ import torch
 
 from torchfovea.sensing.camera import Pinhole
 from torchfovea.sensing.layout import Uniform
-from torchfovea.stereo.costs import Eye, acuity
+from torchfovea.stereo.acuity import acuity
+from torchfovea.stereo.costs import Eye
 from torchfovea.stereo.sheets import sheets
 from torchfovea.stereo.subpixel import Neighbourhood, subpixel
 

@@ -117,6 +117,7 @@ def _close_logs() -> None:
 def _run(command: str, overrides: list[str]) -> int:
     import hydra
 
+    from torchfovea.allocation import keep_memory
     from torchfovea.commands.shared.config import SweepFolder, conf_dir, help_text
     from torchfovea.commands.shared.mistakes import arranged, describe
     from torchfovea.commands.shared.trust import refuse_foreign
@@ -134,6 +135,7 @@ def _run(command: str, overrides: list[str]) -> int:
         return 0
     full_error = os.environ.get("HYDRA_FULL_ERROR") == "1"
     SweepFolder.latest = None
+    keep_memory()
     status = 0
     with _as_program(command, overrides):
         app = hydra.main(version_base="1.3", config_path=conf_dir(), config_name=command)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from contextlib import suppress
 from importlib import import_module
 
 import torch
@@ -28,6 +29,8 @@ def serve(settings: list[str]) -> None:
     except ModuleNotFoundError:  # before it had a home of its own
         found = import_module("torchfovea.commands.bench.command")
         make, known = found._builders, found.PATHS
+    with suppress(ModuleNotFoundError):  # as its command does, if it does
+        import_module("torchfovea.allocation").keep_memory()
     with initialize_config_dir(conf_dir(), version_base="1.3"):
         cfg = compose("bench", settings)
     if cfg.threads is not None:

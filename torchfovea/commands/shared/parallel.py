@@ -15,6 +15,7 @@ from joblib import Parallel, delayed, parallel_config
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 from omegaconf import DictConfig, OmegaConf
 
+from torchfovea.allocation import keep_memory
 from torchfovea.commands.shared.build import whole
 from torchfovea.setting import SettingError, require
 
@@ -93,6 +94,8 @@ def _begin(command: int, folder: str, path: tuple[str, ...]) -> None:
     os.chdir(folder)
     sys.path[:] = path
     torch.set_num_threads(1)
+    os.environ["OPENCV_FOR_THREADS_NUM"] = "1"  # read when it is imported
+    keep_memory()
     threading.Thread(target=_end_with, args=(command,), daemon=True).start()
 
 
