@@ -160,6 +160,58 @@ def test_whole_pixels_draw_no_disparity(exposure):
     assert np.abs(medians).max() < 0.05
 
 
+@pytest.mark.parametrize("half_from_px", [0.1, 3.0], ids=["all_wide", "fovea_narrow"])
+def test_wide_fields_are_matched_at_half_the_size(half_from_px):
+    """Beside the truth, on a slanted plane, by two eyes and by parallel cameras."""
+    params, retina = SGBM(half_from_px=half_from_px), RETINAS[0]
+    left, right = pair(PINHOLE, 0.25, SLANTED)
+    found, _ = match_sgbm(views_of(left, right, 0.25), retina, params)
+    expected, points = truth(PINHOLE, 0.25, SLANTED, found.left_px.double().numpy())
+    with np.errstate(invalid="ignore"):
+        seen = (points[:, 2] > 0.32) & (points[:, 2] < 5) & (np.hypot(*expected.T) < 99)
+    valid = found.valid.numpy()
+    error = np.abs(found.right_px.double().numpy() - expected)[:, 0]
+    assert (valid & seen).sum() / seen.sum() > 0.85 and (valid & ~seen).sum() < 0.05 * valid.sum()
+    assert np.median(error[valid & seen]) < 0.2 * 200 / SIZE
+    # within what is matched as it is, on its border and beyond: of one piece
+    eccentricity = np.hypot(*found.left_px.numpy().T)
+    for inner, outer in ((0, 20), (30, 45), (45, 60), (70, 99)):
+        ring = valid & seen & (eccentricity >= inner) & (eccentricity < outer)
+        assert np.quantile(error[ring], 0.9) < 0.5 * retina.width_px(torch.tensor([float(outer), 0.0])) + 0.3
+    images, cameras, true = rectified_pair()
+    _, disparity = match_sgbm(rectified_views(*images, *cameras, 0.15), retina, params)
+    error = (disparity.disparity - torch.as_tensor(true))[disparity.valid].abs()
+    assert error.quantile(0.9) < 1.0 and disparity.valid.float().mean() > 0.45
+
+
+def test_no_field_is_wide_enough_for_half_the_size():
+    images, cameras, _ = rectified_pair()
+    views = rectified_views(*images, *cameras, 0.15)
+    (ours, _), (plain, _) = (match_sgbm(views, Uniform(2000), SGBM(half_from_px=width)) for width in (99.0, None))
+    assert torch.equal(ours.right_px, plain.right_px) and torch.equal(ours.valid, plain.valid)
+
+
+def test_what_a_near_thing_hides_is_no_more_believed_at_half_the_size():
+    wall, thing = ((0.0, 0.0, 1.0), 1.6), (-0.2, 0.5, -0.6, 0.6, 0.8)
+    left, right = pair(PINHOLE, 0.0, wall, box=thing)
+    views = views_of(left, right, 0.0)
+    shares = []
+    for half_from_px in (None, 3.0):
+        found, _ = match_sgbm(views, RETINAS[0], SGBM(half_from_px=half_from_px))
+        # the strip of the background left of the thing that only the left eye sees
+        x = found.left_px.double().numpy()[:, 0] / PINHOLE.focal_px
+        edge, rows = (-0.2 + BASELINE / 2) / 0.8, np.abs(found.left_px.numpy()[:, 1]) < 40
+        hidden = rows & (x < edge) & (x > edge - BASELINE * (1 / 0.8 - 1 / 1.6))
+        shares.append(found.valid.numpy()[hidden].mean())
+    assert shares[1] < shares[0] + 0.1 and shares[1] < 0.5
+
+
+def test_halved_parameters_mean_the_same():
+    half = SGBM(block_px=7, speckle_px=50, first_disparity_px=-3, disparities=80).halved()
+    assert (half.block_px, half.speckle_px, half.first_disparity_px, half.disparities) == (3, 13, -2, 48)
+    assert half.penalties == (72, 288) and SGBM(left_right_px=-1).halved().left_right_px < 0
+
+
 def test_the_largest_block_that_is_allowed_does_not_wrap_around():
     """Random squares of full contrast, where wrong matches cost most."""
     generator = np.random.default_rng(0)
