@@ -107,7 +107,7 @@ class SGBM:
             block_px=block,
             smooth_small=small,
             smooth_large=max(large, small + 1),
-            left_right_px=-(-self.left_right_px // 2),
+            left_right_px=min(self.left_right_px, -(-self.left_right_px // 2)),
             speckle_px=-(-self.speckle_px // 4),
             speckle_range_px=-(-self.speckle_range_px // 2),
             first_disparity_px=None if self.first_disparity_px is None else self.first_disparity_px // 2,
