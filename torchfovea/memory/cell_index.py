@@ -32,9 +32,10 @@ class CellIndex(NamedTuple):
     """Lookup table of the nearest cell; build it with `build_index`.
 
     Attributes:
-        vectors: (12, rows). Of a texel's first row: its first cell's direction, then three differences to that. Of a
-            chained row: four differences. Differences keep their relative accuracy where cells are close.
-        cells: cell numbers, (rows, 4) int32; unused slots repeat another.
+        vectors: the cells' unit vectors, (3, B Nx), in float64 whatever the cells are: what tells close cells apart is
+            their difference.
+        cells: cell numbers, counted through all sets, (rows, 4) int32. Unused slots of a texel's first row repeat its
+            first cell, those of a chained one too.
         link: (rows,) int32. 0: nothing follows; positive: the first of four rows of the texel's quarters; negative:
             minus the next row of the chain.
         resolution: texels along an edge of the cube; the first B * 6 * resolution² rows are the table.
@@ -84,7 +85,7 @@ def build_index(cells: Tensor) -> CellIndex:
             lattices, duplicates, a single cell.
 
     Returns:
-        The index, in the dtype and on the device of the cells; not differentiable.
+        The index, on the device of the cells; not differentiable.
 
     Raises:
         SettingError: for another shape, no cells, or cells that are zero or not finite.
@@ -277,21 +278,10 @@ def _cut(front: _Frontier, rows: int) -> tuple[_Frontier, _Rows, int]:
 
 def _assemble(filled: list[_Rows], rows: int, p: Tensor, cells: Tensor, resolution: int) -> CellIndex:
     row, slot, cell, first, link_from, link_to = (torch.cat(parts) for parts in zip(*filled, strict=True))
-    count = cells.shape[-2]
-    place = row * SLOTS + slot
     numbers = torch.zeros(rows, dtype=torch.int32, device=p.device)
-    numbers = numbers.index_copy_(0, row, (first % count).int())[:, None].repeat(1, SLOTS)
-    numbers.view(-1).index_copy_(0, place, (cell % count).int())
-    vectors = torch.zeros((rows * SLOTS, 3), dtype=cells.dtype, device=p.device)
-    differs = (cell != first)[:, None]
-    vectors.index_copy_(0, place, (p.index_select(0, cell) - differs * p.index_select(0, first)).to(cells.dtype))
+    numbers = numbers.index_copy_(0, row, first.int())[:, None].repeat(1, SLOTS)
+    numbers.view(-1).index_copy_(0, row * SLOTS + slot, cell.int())
     link = torch.zeros(rows, dtype=torch.int32, device=p.device)
     link.index_copy_(0, link_from, link_to.int())
-    return CellIndex(
-        vectors.view(rows, -1).T.contiguous(),
-        numbers,
-        link,
-        resolution,
-        count,
-        cells.shape[0] if cells.ndim == 3 else None,
-    )
+    batch = cells.shape[0] if cells.ndim == 3 else None
+    return CellIndex(p.T.contiguous(), numbers, link, resolution, cells.shape[-2], batch)

@@ -32,7 +32,7 @@ def join_indices(indices: Sequence[CellIndex]) -> CellIndex:
     """What `build_index` gives for the stacked sets of one-set indices, without building them again.
 
     Args:
-        indices: of one set each, with the same number of cells, in one dtype and on one device.
+        indices: of one set each, with the same number of cells, on one device.
 
     Raises:
         SettingError: for none, an index of several sets, or sets of different sizes.
@@ -47,9 +47,10 @@ def join_indices(indices: Sequence[CellIndex]) -> CellIndex:
         after.append(moved[table:])
         shift += len(one.link) - table
     parts = [slice(None, table), slice(table, None)]
+    numbers = [one.cells + b * one.size for b, one in enumerate(indices)]
     return CellIndex(
-        torch.cat([one.vectors[:, part] for part in parts for one in indices], 1),
-        torch.cat([one.cells[part] for part in parts for one in indices]),
+        torch.cat([one.vectors for one in indices], 1),
+        torch.cat([number[part] for part in parts for number in numbers]),
         torch.cat(links + after),
         indices[0].resolution,
         indices[0].size,
@@ -77,15 +78,16 @@ def index_of_set(index: CellIndex, b: int) -> CellIndex:
     place[kept] = torch.arange(len(kept), dtype=place.dtype, device=kept.device)
     link = index.link.index_select(0, kept)
     link = link.sign() * place.index_select(0, link.abs())
-    parts = index.vectors.index_select(1, kept), index.cells.index_select(0, kept), link
-    return CellIndex(*parts, index.resolution, index.size, None)
+    numbers = index.cells.index_select(0, kept) - b * index.size
+    vectors = index.vectors[:, b * index.size : (b + 1) * index.size]
+    return CellIndex(vectors, numbers, link, index.resolution, index.size, None)
 
 
 def nearest_cell(index: CellIndex, directions: Tensor) -> tuple[Tensor, Tensor]:
     """The cell of the largest inner product with each direction (Eq. 23 with argmax), exactly.
 
-    No other cell's cosine is larger than the returned one's by more than rounding in the index's dtype. Between cells
-    that are equally near any one may be returned, always the same for the same input.
+    No other cell's cosine is larger than the returned one's by more than rounding in the directions' dtype. Between
+    cells that are equally near any one may be returned, always the same for the same input.
 
     Args:
         index: from `build_index`.
@@ -103,7 +105,7 @@ def nearest_cell(index: CellIndex, directions: Tensor) -> tuple[Tensor, Tensor]:
     wanted = "(..., 3)" if index.batch is None else f"({index.batch}, ..., 3)"
     require(fits, "directions", tuple(shape), f"the shape {wanted}")
     # Selection by arithmetic: `torch.where` on an unpredictable mask is twenty times slower than a product on the CPU.
-    kind = index.vectors.dtype
+    kind = torch.promote_types(directions.dtype, torch.float32)
     x, y, z = (t.reshape(-1) for t in directions.detach().to(kind).unbind(-1))
     ax, ay, az = x.abs(), y.abs(), z.abs()
     largest = torch.maximum(torch.maximum(ax, ay), az)
@@ -137,32 +139,39 @@ def nearest_cell(index: CellIndex, directions: Tensor) -> tuple[Tensor, Tensor]:
         link[active] = follows = index.link.index_select(0, child)
         active = active[follows > 0]
 
-    table = index.vectors
+    # rows of numbers and the cells' own vectors stay in the cache, where a table of vectors for every row does not
+    numbers = index.cells.unbind(-1)
+    cell = numbers[0].index_select(0, row)
+    first = [t.index_select(0, cell) for t in index.vectors]
     best = torch.zeros_like(x)
     slot = torch.zeros_like(row)
     for k in range(1, SLOTS):
-        score = x * table[3 * k].index_select(0, row)
-        score.addcmul_(y, table[3 * k + 1].index_select(0, row)).addcmul_(z, table[3 * k + 2].index_select(0, row))
+        cell = numbers[k].index_select(0, row)
+        # the difference is as good as the vectors are, where that of two products would round what is close
+        dx, dy, dz = (t.index_select(0, cell).sub_(f).to(kind) for t, f in zip(index.vectors, first, strict=True))
+        score = (x * dx).addcmul_(y, dy).addcmul_(z, dz)
         slot = torch.maximum(slot, (score > best).int().mul_(k))
         best = torch.maximum(best, score)
     cell = index.cells.view(-1).index_select(0, slot.add_(row, alpha=SLOTS))
     active = (link < 0).nonzero().squeeze(1)
     follows = link.index_select(0, active)
     while len(active):  # chains are rare
-        link_row = -follows
-        q = torch.stack((x[active], y[active], z[active]), -1)
-        vectors = table.index_select(1, link_row).view(SLOTS, 3, -1)
-        score, where = (vectors * q.mT).sum(1).max(0)
+        others = index.cells.index_select(0, -follows)
+        q, own = (torch.stack([t[active] for t in parts]) for parts in ((x, y, z), first))
+        score = ((index.vectors[:, others] - own[..., None]).to(kind) * q[..., None]).sum(0)
+        score, where = score.max(-1)
         better = score > best[active]
         changed = active[better]
         best[changed] = score[better]
-        cell[changed] = index.cells[link_row[better], where[better]]
-        follows = index.link.index_select(0, link_row)
+        cell[changed] = others[better, where[better]]
+        follows = index.link.index_select(0, -follows)
         active, follows = active[follows < 0], follows[follows < 0]
-    cosine = (x * table[0].index_select(0, row)).addcmul_(y, table[1].index_select(0, row))
-    cosine = cosine.addcmul_(z, table[2].index_select(0, row)).add_(best)
+    hx, hy, hz = (t.to(kind) for t in first)
+    cosine = (x * hx).addcmul_(y, hy).addcmul_(z, hz).add_(best)
     cosine = cosine.mul_((x * x).addcmul_(y, y).addcmul_(z, z).rsqrt_()).clamp_(-1, 1)
     cosine = torch.where(valid, cosine, -1)
+    if index.batch is not None:
+        cell = (cell.view(index.batch, -1) - index.size * sets[:, None]).view(-1)
     return torch.where(valid, cell, 0).long().view(shape[:-1]), cosine.view(shape[:-1])
 
 
