@@ -18,7 +18,7 @@ ROOMS = {"sensing", "stereo", "memory", "deciding", "studies"}
 
 # From the ground up. A module imports from its own floor (never in a circle) or from those below it.
 FLOORS = (
-    ("setting", "files", "untrusted", "imported", "compiling", "finite", "rounding", "allocation"),
+    ("setting", "files", "untrusted", "imported", "compiling", "machine", "finite", "rounding", "allocation"),
     ("gaussian",),
     (
         "camera",
@@ -74,6 +74,7 @@ FLOORS = (
         "triangulation",
         "association",
         "classes",
+        "counting",
         "pooling",
         "egosphere",
         "voting",

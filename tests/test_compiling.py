@@ -37,17 +37,17 @@ def pose_of(batch: tuple[int, ...], dtype: torch.dtype):
 
 @pytest.fixture
 def traced(monkeypatch):
-    """Each kernel as one graph, run by PyTorch itself: machine code takes minutes, and a compiler."""
+    """Each kernel as one graph, run by PyTorch itself: machine code takes minutes, and a compiler. No loops in C."""
     monkeypatch.setattr(compiling_module, "_BACKEND", "eager")
+    monkeypatch.setattr("torchfovea.machine._REALS", {})
 
 
 @pytest.mark.parametrize("batch", [(), (2,)])
 @pytest.mark.parametrize("points", [SigmaPoints(), SigmaPoints.paper(), SigmaPoints.midpoint()])
 @pytest.mark.parametrize("rotated", [True, False])
-def test_components_and_stacked_tensors_are_one_transform(batch, points, rotated, monkeypatch):
+def test_components_and_stacked_tensors_are_one_transform(batch, points, rotated, traced, monkeypatch):
     """The form for compilers, run as written, against the form that is the definition."""
-    monkeypatch.setattr(compiling_module, "_BACKEND", "eager")
-    monkeypatch.setattr("torchfovea.sensing.triangulation.pinhole_observations", pinhole_observations.__wrapped__)
+    monkeypatch.setattr("torchfovea.sensing.pinhole.pinhole_observations", pinhole_observations.__wrapped__)
     matches, pose = matches_of(batch, 300, 1, torch.float64), pose_of(batch, torch.float64)
     support = torch.ones(300, dtype=torch.float64)
     told = (matches, pose, CAMERA, support, points, "inverse_range", rotated)

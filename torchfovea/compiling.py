@@ -19,7 +19,16 @@ import torch
 
 from torchfovea.setting import SettingError, require
 
-__all__ = ["MODES", "check_mode", "compiling", "is_compiling", "kernel"]
+__all__ = [
+    "MODES",
+    "cache_folder",
+    "check_mode",
+    "compiling",
+    "is_compiling",
+    "kernel",
+    "must_compile",
+    "wants_gradient",
+]
 
 MODES = ("off", "auto", "on")
 
@@ -59,6 +68,11 @@ def is_compiling() -> bool:
     return _MODE.get() != "off"
 
 
+def must_compile() -> bool:
+    """Whether what cannot be compiled is an error here."""
+    return _MODE.get() == "on"
+
+
 def kernel(function: Callable[_Given, _Made]) -> Callable[_Given, _Made]:
     """A pure function of (nested tuples of) tensors and settings that can run compiled, see `compiling`.
 
@@ -68,11 +82,11 @@ def kernel(function: Callable[_Given, _Made]) -> Callable[_Given, _Made]:
 
     @wraps(function)
     def run(*args: _Given.args, **kwargs: _Given.kwargs) -> _Made:
-        if _MODE.get() == "off" or (torch.is_grad_enabled() and _wants_gradient((args, tuple(kwargs.values())))):
+        if _MODE.get() == "off" or (torch.is_grad_enabled() and wants_gradient((args, tuple(kwargs.values())))):
             return function(*args, **kwargs)
         first = _BACKEND not in compiled
         if first:
-            os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(_cache()))
+            os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(cache_folder()))
             compiled[_BACKEND] = torch.compile(function, fullgraph=True, dynamic=True, backend=_BACKEND)
         fast = compiled[_BACKEND]
         if fast is None:
@@ -84,7 +98,7 @@ def kernel(function: Callable[_Given, _Made]) -> Callable[_Given, _Made]:
         except Exception as cause:  # of the compiler, or of the caller: then the function itself raises it, too
             result = function(*args, **kwargs)
             why = " ".join(str(cause).split("\n\n")[0].split()) or type(cause).__name__
-            if _MODE.get() == "on":
+            if must_compile():
                 raise SettingError(
                     f"compile = on: expected that {function.__name__} can be compiled here, or auto ({why})"
                 ) from cause
@@ -106,13 +120,14 @@ def _quiet(wanted: bool) -> Iterator[None]:
         yield
 
 
-def _wants_gradient(value: Any) -> bool:
+def wants_gradient(value: Any) -> bool:
+    """Whether a gradient is asked of any of the tensors in nested tuples and lists."""
     if isinstance(value, tuple | list):
-        return any(map(_wants_gradient, value))
+        return any(map(wants_gradient, value))
     return isinstance(value, torch.Tensor) and value.requires_grad
 
 
-def _cache() -> Path:
+def cache_folder() -> Path:
     """Where machine code is kept, unless PyTorch has been told another place."""
     home = os.environ.get("XDG_CACHE_HOME")
     return (Path(home) if home else Path.home() / ".cache") / "torchfovea" / "kernels"

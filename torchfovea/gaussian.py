@@ -27,6 +27,7 @@ __all__ = [
     "positive_definite",
     "quadratic3",
     "rotate3",
+    "rounding_of_minors",
     "times3",
     "unpack",
 ]
@@ -101,11 +102,16 @@ def positive_definite(sym: Tensor, tolerance: float | None = None) -> Tensor:
     return definiteness(sym.detach().unbind(-1), tolerance) > 0
 
 
+def rounding_of_minors(dtype: torch.dtype) -> float:
+    """What the minors of a matrix that can be inverted in a type exceed."""
+    return max(8 * torch.finfo(dtype).eps, 1e-13)
+
+
 def definiteness(sym: Sequence[Tensor], tolerance: float | None = None) -> Tensor:
     """The number that `positive_definite` compares, of six components (...): positive there, elsewhere not, or NaN."""
     xx, xy, xz, yy, yz, zz = sym
     if tolerance is None:
-        tolerance = max(8 * torch.finfo(xx.dtype).eps, 1e-13)
+        tolerance = rounding_of_minors(xx.dtype)
     sx, sy, sz = xx.rsqrt(), yy.rsqrt(), zz.rsqrt()  # NaN, which no comparison passes, for what is not positive
     xy, xz, yz = xy * sx * sy, xz * sx * sz, yz * sy * sz
     minor, other, rest = 1 - xy * xy, 1 - xz * xz, yz - xy * xz

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchfovea.gaussian import columns, positive_definite
+from torchfovea.gaussian import columns, positive_definite, rounding_of_minors
+from torchfovea.machine import Loops, columns_of, loops
 from torchfovea.memory.nearest import CellIndex, nearest_cell, nearest_observation
 from torchfovea.sensing.triangulation import Observations
 
@@ -62,6 +63,9 @@ def associate(
     Returns:
         The pairs. Not differentiable.
     """
+    library = loops(cells, observed.mean, observed.cov, observed.direction, observed.support_rad, spacing_rad)
+    if library is not None:
+        return _by_loops(library, cells, index, spacing_rad, observed, (gate_rad, gate_spacing, fill))
     good = usable(observed)
     cell, cosine = nearest_cell(index, observed.direction)
     angle = torch.acos(cosine.clamp(-1, 1))
@@ -91,6 +95,29 @@ def associate(
     within = ((apart * apart).sum(-1) <= chord * chord).nonzero().squeeze(1)
     source, extra = source.index_select(0, within), extra.index_select(0, within)
     return Pairs(torch.cat([pair, source]), torch.cat([cell, extra]))
+
+
+def _by_loops(
+    library: Loops,
+    cells: Tensor,
+    index: CellIndex,
+    spacing_rad: Tensor,
+    observed: Observations,
+    gates: tuple[float, float, bool],
+) -> Pairs:
+    """`associate` by the loops of associate.c."""
+    valid = observed.valid.contiguous()
+    sets, count, size = valid.shape[:-1].numel(), valid.shape[-1], cells.shape[-2]
+    vectors = (columns_of(part) for part in (observed.direction, observed.mean, observed.cov))
+    support = observed.support_rad.expand(valid.shape).contiguous()
+    given = (sets, count, size, *vectors, support, valid, columns_of(cells), spacing_rad.contiguous())
+    given = (*given, rounding_of_minors(cells.dtype))
+    table = (index.vectors.contiguous(), index.cells.contiguous(), index.link.contiguous(), index.resolution)
+    kinds = torch.empty(2, sets * (count + size), dtype=torch.int64)
+    found = library("associate", given, table, *map(float, gates[:2]), int(gates[2]), kinds[0], kinds[1])
+    if found < 0:
+        raise MemoryError("associate")
+    return Pairs(kinds[0, :found], kinds[1, :found])
 
 
 def in_front(near: Tensor, std: Tensor, cell: Tensor, cells: int, limit: float, hides: Tensor | None = None) -> Tensor:

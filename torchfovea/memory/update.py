@@ -15,8 +15,10 @@ from torch import Tensor
 
 from torchfovea.compiling import kernel
 from torchfovea.gaussian import Gaussian, Information, columns
+from torchfovea.machine import loops
 from torchfovea.memory.association import Pairs, associate, gather_columns
 from torchfovea.memory.classes import join_evidence
+from torchfovea.memory.counting import count_look
 from torchfovea.memory.egosphere import Fusion, Memory, Prior, blend, check_chart, forget
 from torchfovea.memory.pooling import Pooled, add_common, found_points, nearness, pool, pool_patches, share_errors
 from torchfovea.memory.voting import cast, see
@@ -91,6 +93,16 @@ def remember(
         memory = memory._replace(classes=join_evidence(memory.classes, evidence, pairs))
     if memory.chart == "cartesian":
         return _remember_points(memory, observed, pairs, fusion, common)
+    known = observed.mean, observed.cov, observed.direction, observed.inlier, memory.looks, memory.votes, memory.lasting
+    library = loops(*known, None if kin is None else kin.lasting.to(cells.dtype))
+    if library is not None:
+        join = kin is None and common is None
+        counted = count_look(library, memory, observed, pairs, fusion, kin, join)
+        return (
+            counted.memory
+            if counted.pooled is None
+            else _join(counted.memory, counted.pooled, counted.kinship, kin, common)
+        )
     # where the eye looked last is not asked: what comes with the first look would have to be compiled anew
     after = _remember_patches(memory._replace(axis=None), observed, pairs, fusion, common, kin)
     return after._replace(axis=memory.axis)
@@ -135,7 +147,7 @@ def _remember_patches(
     pooled = pool_patches(
         sight.rho, sight.variance, sight.bearing, sight.row, ballot.keep, sight.cell, cells.shape[:-1]
     )
-    lasting = None
+    kinship = None
     if kin is not None:
         patch, lasts = (
             part.to(ballot.keep).reshape(-1).index_select(0, pairs.observation) for part in (kin.patch, kin.lasting)
@@ -144,13 +156,27 @@ def _remember_patches(
         parts = torch.stack([root.square(), root, root * lasts.sqrt(), patch]) * ballot.keep
         sums = parts.new_zeros(4, pooled.hits.numel()).scatter_add(1, sight.cell.expand(4, -1), parts)
         *precision, patches = sums.reshape(4, *pooled.hits.shape)
-        pooled, lasting = share_errors(pooled, columns(*precision), patches, kin.shared)
+        kinship = columns(*precision), patches
+    memory = memory._replace(looks=memory.looks + (ballot.hits > 0))
+    return _join(memory, pooled, kinship, kin, common)
+
+
+def _join(
+    memory: Memory,
+    pooled: Pooled,
+    kinship: tuple[Tensor, Tensor] | None,
+    kin: Kinship | None,
+    common: Common | None,
+) -> Memory:
+    """What the look's votes left of the memory, and what it tells with all that its errors have in common."""
+    prior, lasting = memory.prior, None
+    if kin is not None and kinship is not None:
+        pooled, lasting = share_errors(pooled, *kinship, kin.shared)
     pooled = _add(pooled, memory, common)
     if lasting is not None:
         weight = torch.where(pooled.hits > 0, 1 / _variance(pooled, prior), 0.0)
         lasting = columns(weight * torch.where(lasting > 0, lasting, 1.0).sqrt() * (lasting > 0), weight**2 * lasting)
-    after = fuse(memory, pooled, lasting)
-    return after._replace(looks=memory.looks + (ballot.hits > 0))
+    return fuse(memory, pooled, lasting)._replace(looks=memory.looks)
 
 
 def _variance(pooled: Pooled, prior: Prior) -> Tensor:

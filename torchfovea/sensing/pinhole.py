@@ -2,7 +2,7 @@
 
 It is what `torchfovea.sensing.triangulation.observe` does by stacked tensors (`bilinear_moments`), which is the
 definition and as fast as PyTorch's own functions go. Compiled, the components below are one loop over the receptive
-fields, in which no intermediate result leaves the processor's registers.
+fields, in which no intermediate result leaves the processor's registers: on the CPU that of observe.c.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ import torch
 from torch import Tensor
 
 from torchfovea.compiling import kernel
-from torchfovea.gaussian import definiteness
+from torchfovea.gaussian import definiteness, rounding_of_minors
+from torchfovea.machine import Loops, columns_of, loops
 from torchfovea.sensing.unscented import SigmaPoints
 
-__all__ = ["Weights", "pinhole_observations", "weights_of"]
+__all__ = ["Weights", "fast_observations", "pinhole_observations", "weights_of"]
 
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
@@ -42,6 +43,51 @@ def weights_of(points: SigmaPoints) -> Weights:
     """The numbers of sigma points of four dimensions."""
     mean, cov = points.weights
     return Weights(points.spread, mean[1], sum(cov) - 2, points.by_axis)
+
+
+def fast_observations(
+    left_px: Tensor,
+    right_px: Tensor,
+    sigmas: tuple[Tensor, Tensor],
+    valid: Tensor,
+    form: tuple[Tensor, Tensor, Tensor],
+    weights: Weights,
+    rotated: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`pinhole_observations` by the loop of observe.c where there is one, else as a kernel; see there."""
+    library = loops(left_px, right_px, *sigmas, *form)
+    if library is None:
+        return pinhole_observations(left_px, right_px, sigmas, valid, form, weights, rotated)
+    return _by_loops(library, (left_px, right_px), sigmas, valid, form, weights, rotated)
+
+
+def _by_loops(
+    library: Loops,
+    places: tuple[Tensor, Tensor],
+    sigmas: tuple[Tensor, Tensor],
+    valid: Tensor,
+    form: tuple[Tensor, Tensor, Tensor],
+    weights: Weights,
+    rotated: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    shape, like = valid.shape, places[0]
+    share = 1 - 2 * weights.each if weights.by_axis else 1.0
+    numbers = (weights.spread, weights.each, 0.0 if weights.by_axis else weights.rest, share, int(rotated))
+    given = (
+        shape[:-1].numel(),
+        shape[-1],
+        *map(columns_of, places),
+        *(sigma.expand(shape).contiguous() for sigma in sigmas),
+        valid.contiguous(),
+        *(part.expand(*part.shape[: -len(shape)], *shape[:-1], 1).contiguous() for part in form),
+    )
+    found = (
+        like.new_empty(9, *shape),
+        like.new_empty(3, *shape),
+        torch.empty_like(valid, memory_format=torch.contiguous_format),
+    )
+    library("observe", given, (*numbers, rounding_of_minors(like.dtype)), found)
+    return found
 
 
 @kernel

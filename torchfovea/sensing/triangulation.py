@@ -17,7 +17,7 @@ from torchfovea.sensing.chart import Components, bilinear_moments, in_tangent_fr
 from torchfovea.sensing.correspondence import Correspondences
 from torchfovea.sensing.head import Eyes, rig_frame
 from torchfovea.sensing.head import to_ego as turn
-from torchfovea.sensing.pinhole import pinhole_observations, weights_of
+from torchfovea.sensing.pinhole import fast_observations, weights_of
 from torchfovea.sensing.unscented import SigmaPoints, eye_root, moments, root_rows, sigma_components
 from torchfovea.setting import require
 
@@ -200,7 +200,7 @@ def observe(
     parts = []
     if form is not None and is_compiling() and not learning:
         arguments = (*matches[:2], (matches[2], matches[3]), matches.valid, form, weights_of(points), rotated)
-        parts = [pinhole_observations(*arguments)]
+        parts = [fast_observations(*arguments)]
     for start in () if parts else range(0, max(count, 1), max(size, 1)):
         axes = zip(matches[:5], (-2, -2, -1, -1, -1), strict=True)
         part = Correspondences(*(t.narrow(axis, start, min(size, count - start)) for t, axis in axes))
