@@ -8,8 +8,9 @@ import pytest
 import torch
 from test_compiling import CAMERA, matches_of, pose_of
 
-from torchfovea import Fusion, Head, LogPolar, Observer, compiled, new_memory, perceive
+from torchfovea import Eligibility, Fusion, Head, LogPolar, Observer, compiled, decide, new_memory, perceive
 from torchfovea.compiling import compiling
+from torchfovea.gaussian import Information, columns
 from torchfovea.machine import _built, _say_once, loops
 from torchfovea.memory.association import associate
 from torchfovea.memory.nearest import build_index, neighbour_spacing_rad
@@ -19,6 +20,7 @@ from torchfovea.sensing.triangulation import Observations, observe
 from torchfovea.sensing.unscented import SigmaPoints
 from torchfovea.setting import SettingError
 
+PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 CLOSE = {torch.float32: {"rtol": 2e-4, "atol": 2e-5}, torch.float64: {"rtol": 1e-9, "atol": 1e-12}}
 
 
@@ -184,3 +186,32 @@ def test_what_is_built_is_kept(monkeypatch, tmp_path):
 
 def test_a_compiled_observer_is_equal_but_for_that():
     assert dataclasses.replace(compiled(Observer(), "auto"), compile="off") == Observer()
+
+
+@pytest.mark.parametrize("dtype", CLOSE)
+@pytest.mark.parametrize("batch", [(), (2,)])
+@pytest.mark.parametrize("reward", ["inverse_range", "range"])
+def test_a_loop_appraises_as_the_definition(batch, reward, dtype):
+    """Cells seen and not, doubted, on the floor, too near, behind, out of reach, with and without what lasts."""
+    head = Head(pan_limit_deg=60.0, tilt_down_deg=30.0)
+    observer = Observer(head=head, reward=reward)
+    generator = torch.Generator().manual_seed(0)
+    draw = partial(torch.rand, *batch, 700, generator=generator, dtype=torch.float64)
+    memory = new_memory(observer, fibonacci_directions(700).to(dtype).expand(*batch, 700, 3))
+    looks, sure = torch.floor(3 * draw()), 0.5 + 100 * draw()
+    rows = torch.stack([0.1 * draw() - 0.05, 0.1 * draw() - 0.05, torch.ones_like(sure)], -1)
+    matrix = (looks * sure)[..., None] * columns(*(rows[..., i] * rows[..., j] for i, j in PAIRS))
+    vector = (looks * sure * (2.5 * draw() - 0.2))[..., None] * rows
+    first = memory.information
+    memory = memory._replace(
+        information=Information(first.vector + columns(*vector.unbind(-1)), first.matrix + matrix),
+        bearing=(memory.bearing + looks * sure).to(dtype),
+        looks=looks.to(dtype),
+        lasting=columns(looks * draw(), looks * 0.1 * draw()).to(dtype),
+        votes=columns((looks > 0) * draw(), draw() * (draw() < 0.7)).to(dtype),
+    )
+    decided = [decide(one, memory) for one in (observer, compiled(observer, "on"))]
+    assert 0.05 < float(decided[0].eligible.double().mean()) < 0.5
+    same(*(step._replace(memory=(), state=()) for step in decided), dtype)
+    floor = dataclasses.replace(observer, eligibility=Eligibility(nearest_m=1e6))
+    same(*(decide(one, memory)._replace(memory=(), state=()) for one in (floor, compiled(floor, "on"))), dtype)

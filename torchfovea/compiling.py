@@ -2,6 +2,7 @@
 
 A kernel is compiled the first time that it runs where compiling is on, for half a minute or so. Its machine code is
 kept on disk, under a key that PyTorch makes of all that it depends on, so that another process starts within seconds.
+On the CPU `torchfovea.machine` has loops in C for most of it, which come first.
 """
 
 from __future__ import annotations

@@ -131,8 +131,9 @@ class Step(NamedTuple):
 def compiled(observer: Observer, mode: str = "auto") -> Observer:
     """The same observer, whose `perceive` and `decide` run as compiled kernels, with equal results to rounding.
 
-    Compiling takes a minute or so the first time, seconds in a new process, and nothing once it is done; see
-    `torchfovea.compiling`.
+    On the CPU those are loops in C, which take a second or two to build the first time on a machine
+    (`torchfovea.machine`); what no loop does is left to PyTorch's compiler, which takes half a minute
+    (`torchfovea.compiling`).
 
     Args:
         observer: any; what its settings leave uncompiled runs as written.

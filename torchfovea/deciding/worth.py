@@ -19,8 +19,10 @@ from torchfovea.deciding.reward import (
     user_reward,
 )
 from torchfovea.gaussian import Gaussian, columns
+from torchfovea.machine import Loops, columns_of, loops
 from torchfovea.memory.classes import class_moments
 from torchfovea.memory.egosphere import (
+    FAR_M,
     Memory,
     belief,
     cartesian_from_patches,
@@ -28,7 +30,7 @@ from torchfovea.memory.egosphere import (
     reducible,
     trust,
 )
-from torchfovea.sensing.head import Head, Kinematics, can_fixate
+from torchfovea.sensing.head import FARTHEST_M, Head, Kinematics, can_fixate, turns_of
 
 __all__ = ["Appraisal", "appraise", "worth_of_cells"]
 
@@ -55,7 +57,6 @@ class Appraisal(NamedTuple):
     incumbent: Tensor
 
 
-@kernel
 def appraise(
     memory: Memory, measure: Measure, sought: int | None, head: Head | Kinematics, limits: Eligibility
 ) -> Appraisal:
@@ -70,6 +71,17 @@ def appraise(
 
     Differentiable but in what may be fixated.
     """
+    if isinstance(measure, str) and isinstance(head, Head) and memory.chart != "cartesian" and memory.classes is None:
+        library = loops(memory.cells, memory.bearing, memory.looks, memory.lasting, memory.votes)
+        if library is not None:
+            return _by_loops(library, memory, measure, head, limits)
+    return _appraise(memory, measure, sought, head, limits)
+
+
+@kernel
+def _appraise(
+    memory: Memory, measure: Measure, sought: int | None, head: Head | Kinematics, limits: Eligibility
+) -> Appraisal:
     points, reward, open_to_looks = worth_of_cells(memory, measure, sought)
     seen = memory.looks > 0
     # the eyes meet where the surface is, or where an unseen one would be while it is more likely not there
@@ -86,6 +98,38 @@ def appraise(
     incumbent = torch.where(torch.isfinite(incumbent), incumbent, torch.where(eligible, reward.mean, floor).amax(-1))
     incumbent = torch.where(torch.isfinite(incumbent), incumbent, torch.zeros_like(incumbent))
     return Appraisal(points, reward, open_to_looks, target, eligible, incumbent)
+
+
+def _by_loops(library: Loops, memory: Memory, measure: str, head: Head, limits: Eligibility) -> Appraisal:
+    """`appraise` by the loops of appraise.c."""
+    cells, prior = memory.cells, memory.prior
+    shape = memory.looks.shape
+    known = (
+        shape[:-1].numel(),
+        shape[-1],
+        *map(columns_of, memory.information),
+        memory.bearing.contiguous(),
+        memory.looks.contiguous(),
+        *map(columns_of, (memory.lasting, memory.votes, cells)),
+    )
+    then = RewardBelief(*(torch.tensor(v, dtype=cells.dtype) for v in (prior.mean, prior.std)))
+    mean, std = map(float, range_from_inverse_range(then) if measure == "range" else then)
+    ground = (head.ego_height_m, limits.ground_z_m, limits.ground_sigmas)
+    numbers = (FAR_M, torch.finfo(cells.dtype).tiny, *ground, limits.nearest_m, mean, std, 1 / prior.mean)
+    turns = (angle for pair in turns_of(head) for angle in pair)
+    reach = (head.eyes_up_m, head.eyes_forward_m, head.nearest_m, FARTHEST_M, *turns)
+    points, cov, reward, target = (cells.new_empty(parts, *shape) for parts in (3, 6, 3, 3))
+    eligible, incumbent = torch.empty(shape, dtype=torch.bool), cells.new_empty(shape[:-1])
+    given = (*map(float, numbers), int(measure == "range"))
+    library(
+        "appraise",
+        known,
+        given,
+        tuple(map(float, reach)),
+        (points, cov, *reward.unbind(0), target, eligible, incumbent),
+    )
+    beliefs = Gaussian(points.movedim(0, -1), cov.movedim(0, -1)), RewardBelief(reward[0], reward[1])
+    return Appraisal(*beliefs, reward[2], target.movedim(0, -1), eligible, incumbent)
 
 
 def worth_of_cells(

@@ -37,9 +37,9 @@ typedef struct {
     double tolerance; /* of covariances' minors */
 } Look;
 
-typedef struct { /* where directions meet the cube, in texels of the table */
-    REAL x[BLOCK], y[BLOCK], z[BLOCK], u[BLOCK], v[BLOCK];
-    int32_t row[BLOCK];
+typedef struct { /* where directions meet the cube, in texels of the table; what is found there */
+    REAL x[BLOCK], y[BLOCK], z[BLOCK], u[BLOCK], v[BLOCK], cosine[BLOCK];
+    int32_t row[BLOCK], link[BLOCK], cell[BLOCK], active[BLOCK];
 } Places;
 
 static REAL larger(REAL a, REAL b) { return a > b ? a : b; }
@@ -84,34 +84,51 @@ static void place(const Look *look, const Table *table, int64_t set, int64_t fir
     }
 }
 
-/* The cell nearest to a direction, counted through all sets, and the cosine between them. */
-static int32_t nearest(const Table *table, int64_t cells, const Places *at, int64_t i, REAL *cosine) {
-    int32_t row = at->row[i], link = table->link[row], size = (int32_t)table->resolution;
-    while (link > 0) { /* cut into quarters */
-        size *= 2;
+/* Follow texels that are cut into quarters to the row that counts. Level by level, so that memory answers many at once. */
+static void follow(const Table *table, int64_t count, Places *at) {
+    const int32_t *link = table->link;
+    int64_t left = 0;
+    for (int64_t i = 0; i < count; i++) at->link[i] = link[at->row[i]];
+    for (int64_t i = 0; i < count; i++) at->active[left] = (int32_t)i, left += at->link[i] > 0;
+    for (int32_t size = 2 * (int32_t)table->resolution; left > 0; size *= 2) {
         const REAL finer = (REAL)size / table->resolution;
-        row = link + 2 * (within(at->u[i] * finer, size) & 1) + (within(at->v[i] * finer, size) & 1);
-        link = table->link[row];
-    }
-    const int32_t *number = table->cells + (int64_t)row * SLOTS;
-    const double *px = table->vectors, *py = px + cells, *pz = py + cells;
-    const REAL x = at->x[i], y = at->y[i], z = at->z[i];
-    const double fx = px[number[0]], fy = py[number[0]], fz = pz[number[0]];
-    REAL best = 0;
-    int32_t cell = number[0];
-    for (;;) { /* a row, and those chained to it */
-        for (int k = 0; k < SLOTS; k++) {
-            const int32_t other = number[k];
-            const REAL score = x * (REAL)(px[other] - fx) + y * (REAL)(py[other] - fy) + z * (REAL)(pz[other] - fz);
-            cell = score > best ? other : cell;
-            best = score > best ? score : best;
+        int64_t more = 0;
+        for (int64_t k = 0; k < left; k++) {
+            const int32_t i = at->active[k];
+            at->row[i] = at->link[i] + 2 * (within(at->u[i] * finer, size) & 1) + (within(at->v[i] * finer, size) & 1);
         }
-        if (link >= 0) break;
-        number = table->cells - (int64_t)link * SLOTS;
-        link = table->link[-link];
+        for (int64_t k = 0; k < left; k++) {
+            const int32_t i = at->active[k];
+            at->link[i] = link[at->row[i]];
+            at->active[more] = i, more += at->link[i] > 0;
+        }
+        left = more;
     }
-    *cosine = (x * (REAL)fx + y * (REAL)fy + z * (REAL)fz + best) / sqrt(x * x + y * y + z * z);
-    return cell;
+}
+
+/* The cells nearest to directions, counted through all sets, and the cosines between them. */
+static void find_nearest(const Table *table, int64_t cells, int64_t count, Places *at) {
+    const double *px = table->vectors, *py = px + cells, *pz = py + cells;
+    follow(table, count, at);
+    for (int64_t i = 0; i < count; i++) {
+        const int32_t *number = table->cells + (int64_t)at->row[i] * SLOTS;
+        const REAL x = at->x[i], y = at->y[i], z = at->z[i];
+        const double fx = px[number[0]], fy = py[number[0]], fz = pz[number[0]];
+        REAL best = 0;
+        int32_t cell = number[0];
+        for (int32_t link = at->link[i];; link = table->link[-link]) { /* a row, and those chained to it, which are rare */
+            for (int k = 0; k < SLOTS; k++) {
+                const int32_t other = number[k];
+                const REAL dx = px[other] - fx, dy = py[other] - fy, dz = pz[other] - fz, score = x * dx + y * dy + z * dz;
+                cell = score > best ? other : cell;
+                best = score > best ? score : best;
+            }
+            if (link >= 0) break;
+            number = table->cells - (int64_t)link * SLOTS;
+        }
+        at->cell[i] = cell;
+        at->cosine[i] = (x * (REAL)fx + y * (REAL)fy + z * (REAL)fz + best) / sqrt(x * x + y * y + z * z);
+    }
 }
 
 /* Whether the angle of a cosine is at most a gate [rad]: the series of the cosine settles all but a few. */
@@ -220,16 +237,15 @@ int64_t associate(const Look *look, const Table *table, double gate_rad, double 
     for (int64_t start = 0; start < all && pairs >= 0;) {
         const int64_t set = start / n, end = (set + 1) * n, count = end - start < BLOCK ? end - start : BLOCK;
         place(look, table, set, start, count, good + start, &at);
+        find_nearest(table, cells, count, &at);
         for (int64_t i = 0; i < count; i++) {
-            if (!good[start + i]) continue;
-            REAL cosine;
-            const int32_t which = nearest(table, cells, &at, i, &cosine);
             const REAL support = look->support[start + i];
-            if (support > widest) widest = support;
-            const REAL gate = larger((REAL)gate_spacing * look->spacing[which], (REAL)gate_rad);
-            if (!passes(cosine, larger(gate, support))) continue;
-            taken[which] = 1;
-            observation[pairs] = start + i, cell[pairs++] = which;
+            const REAL gate = larger((REAL)gate_spacing * look->spacing[at.cell[i]], (REAL)gate_rad);
+            const int good_one = good[start + i], pair = good_one && passes(at.cosine[i], larger(gate, support));
+            if (good_one && support > widest) widest = support;
+            taken[at.cell[i]] |= pair;
+            observation[pairs] = start + i, cell[pairs] = at.cell[i];
+            pairs += pair;
         }
         start += count;
     }

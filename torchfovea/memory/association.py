@@ -113,7 +113,7 @@ def _by_loops(
     given = (sets, count, size, *vectors, support, valid, columns_of(cells), spacing_rad.contiguous())
     given = (*given, rounding_of_minors(cells.dtype))
     table = (index.vectors.contiguous(), index.cells.contiguous(), index.link.contiguous(), index.resolution)
-    kinds = torch.empty(2, sets * (count + size), dtype=torch.int64)
+    kinds = torch.empty(2, sets * (count + size) + 1, dtype=torch.int64)
     found = library("associate", given, table, *map(float, gates[:2]), int(gates[2]), kinds[0], kinds[1])
     if found < 0:
         raise MemoryError("associate")

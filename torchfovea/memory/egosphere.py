@@ -192,6 +192,7 @@ def empty_memory(cells: Tensor, prior: Prior, chart: str = "inverse_range") -> M
     first, bearing = prior_information(cells, prior, chart)
     # copies: kernels are compiled anew for what is a view of other tensors, as these are, but not after the first look
     known = Information(*(part.clone() for part in first)), bearing
+    cells = columns(*cells.unbind(-1)).clone()
     return Memory(cells, *known, zero, columns(zero, zero).clone(), columns(zero, zero), *found, prior, chart)
 
 

@@ -126,35 +126,45 @@ static void count(const REAL sums[4], const Memory *before, Memory *after, int64
     after->looks[c] = before->looks[c] + reached;
 }
 
+static void keep_sums(const double *restrict from, double *restrict to, int64_t cells, const uint8_t *restrict anew, double other) {
+    for (int64_t c = 0; c < cells; c++) {
+        const double kept = from[c];
+        to[c] = anew[c] ? other : kept;
+    }
+}
+
+static void keep(const REAL *restrict from, REAL *restrict to, int64_t cells, const uint8_t *restrict anew, REAL other) {
+    for (int64_t c = 0; c < cells; c++) {
+        const REAL kept = from[c];
+        to[c] = anew[c] ? other : kept;
+    }
+}
+
 /* What is left of a cell that takes another surface is the prior: `torchfovea.memory.egosphere.blend`. */
 static void blend(const Memory *before, Memory *after, int64_t cells, const uint8_t *anew, const Settings *by) {
     const double weight = 1 / (by->std * by->std), slope = 1 / (by->slope_std * by->slope_std);
     const double prior[9] = {0, 0, by->mean * weight, slope, 0, 0, slope, 0, weight};
     const REAL bearing = 1 / (by->bearing_std * by->bearing_std);
-    for (int k = 0; k < 9; k++) {
-        const double *from = k < 3 ? before->vector + k * cells : before->matrix + (k - 3) * cells;
-        double *to = k < 3 ? after->vector + k * cells : after->matrix + (k - 3) * cells;
-        for (int64_t c = 0; c < cells; c++) to[c] = anew[c] ? prior[k] : from[c];
-    }
-    for (int64_t c = 0; c < cells; c++) after->bearing[c] = anew[c] ? bearing : before->bearing[c];
-    for (int k = 0; k < 2; k++)
-        for (int64_t c = k * cells; c < (k + 1) * cells; c++) after->lasting[c] = anew[c - k * cells] ? 0 : before->lasting[c];
+    for (int k = 0; k < 3; k++) keep_sums(before->vector + k * cells, after->vector + k * cells, cells, anew, prior[k]);
+    for (int k = 0; k < 6; k++) keep_sums(before->matrix + k * cells, after->matrix + k * cells, cells, anew, prior[3 + k]);
+    keep(before->bearing, after->bearing, cells, anew, bearing);
+    for (int k = 0; k < 2; k++) keep(before->lasting + k * cells, after->lasting + k * cells, cells, anew, 0);
 }
 
 /* Add up an observation's information, `torchfovea.memory.pooling.pool_patches`, and what kinship asks for. */
-static void add(const Look *look, const Sight *s, REAL keep, int64_t p, Pooled *to) {
+static void add(const Look *look, const Sight *s, REAL share, int64_t p, Pooled *to) {
     const int64_t cells = look->cells, c = look->cell[p], i = look->observation[p];
-    const double x = s->x, y = s->y, z = s->z, rho = s->rho, weight = keep / s->variance;
+    const double x = s->x, y = s->y, z = s->z, rho = s->rho, weight = share / s->variance;
     const double wx = weight * x, wy = weight * y, wz = weight * z;
     const double vector[3] = {wx * rho, wy * rho, wz * rho}, matrix[6] = {wx * x, wx * y, wx * z, wy * y, wy * z, wz * z};
     for (int k = 0; k < 3; k++) to->vector[k * cells + c] += vector[k];
     for (int k = 0; k < 6; k++) to->matrix[k * cells + c] += matrix[k];
-    to->bearing[c] += keep * (2 / s->across);
-    if (to->hits) to->hits[c] += keep;
+    to->bearing[c] += share * (2 / s->across);
+    if (to->hits) to->hits[c] += share;
     if (!to->kinship) return;
     const REAL root = 1 / sqrt(s->variance);
     const REAL more[4] = {root * root, root, root * sqrt(look->lasts[i]), look->patch[i]};
-    for (int k = 0; k < 4; k++) to->kinship[k * cells + c] += keep * more[k];
+    for (int k = 0; k < 4; k++) to->kinship[k * cells + c] += share * more[k];
 }
 
 /* A look's votes, counted; what was believed and still is, in `after`; what the look tells, added to `pooled`, which

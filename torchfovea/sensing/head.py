@@ -18,6 +18,7 @@ from torchfovea.sensing.kinematics import Eyes, Gaze, Kinematics, axes_meet, rig
 from torchfovea.setting import require
 
 __all__ = [
+    "FARTHEST_M",
     "Eyes",
     "Gaze",
     "Head",
@@ -30,10 +31,11 @@ __all__ = [
     "gaze_point",
     "rig_frame",
     "to_ego",
+    "turns_of",
 ]
 
 
-_FARTHEST_M = 1e12
+FARTHEST_M = 1e12  # farther points are looked at as if they were here
 
 
 @dataclass(frozen=True)
@@ -190,6 +192,13 @@ def _limits_deg(head: Head) -> tuple[float, float, float]:
     return head.pan_limit_deg, -head.tilt_up_deg, head.tilt_down_deg
 
 
+def turns_of(head: Head) -> tuple[tuple[float, float], ...]:
+    """Sine and cosine of how far a head sees by turning: of pan to either side, and of tilt, up and down."""
+    pan, low, high = _limits_deg(head)
+    reached = min(pan + head.sight_deg, 180.0), low - head.sight_deg, high + head.sight_deg
+    return tuple((math.sin(math.radians(a)), math.cos(math.radians(a))) for a in reached)
+
+
 def _aim(head: Head, point: Tensor) -> tuple[tuple[Tensor, ...], Tensor, Tensor, Tensor, Tensor]:
     """A point as the head's inverse kinematics wants it.
 
@@ -204,7 +213,7 @@ def _aim(head: Head, point: Tensor) -> tuple[tuple[Tensor, ...], Tensor, Tensor,
         largest = torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs())
         finite = largest < math.inf
         # all angles are there long before squares overflow; what is not finite counts as a point at the origin
-        less = torch.where(finite, _FARTHEST_M / largest.clamp(min=_FARTHEST_M), 0.0)
+        less = torch.where(finite, FARTHEST_M / largest.clamp(min=FARTHEST_M), 0.0)
     one = torch.ones_like(x)
     x, y, z = (torch.where(finite, c, one) * less for c in (x, y, z))
     up, forward = head.eyes_up_m, head.eyes_forward_m
@@ -214,13 +223,9 @@ def _aim(head: Head, point: Tensor) -> tuple[tuple[Tensor, ...], Tensor, Tensor,
     solvable = (side > 1e-12) & (ahead > max(forward + 1e-3, 1e-3) ** 2)
     x, y, z = (torch.where(solvable, c, one) for c in (x, y, z))
     side, reach = (torch.where(solvable, square, one).sqrt() for square in (side, ahead))
-    pan, low, high = _limits_deg(head)
-    reached = min(pan + head.sight_deg, 180.0), low - head.sight_deg, high + head.sight_deg
     with torch.no_grad():
         # angles α ≤ β where sin(β − α) ≥ 0: of pan, and of tilt, the angle from (side, z) to (reach, up)
-        (pan_s, pan_c), (up_s, up_c), (down_s, down_c) = (
-            (math.sin(math.radians(a)), math.cos(math.radians(a))) for a in reached
-        )
+        (pan_s, pan_c), (up_s, up_c), (down_s, down_c) = turns_of(head)
         sine, cosine = up * side - reach * z, reach * side + up * z
         within = (pan_s * x >= pan_c * y.abs()) & (up_c * sine >= up_s * cosine) & (down_c * sine <= down_s * cosine)
         within &= solvable & (reach - forward >= head.nearest_m)

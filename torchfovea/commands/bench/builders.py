@@ -73,7 +73,7 @@ def builders_of(cfg: DictConfig, device: str, wanted: Sequence[str]) -> list[Cal
         (PATHS[1:4], lambda: paths_of_look(look())),
         (PATHS[4:6], lambda: paths_of_steps(look(), full)),
         (("step",), lambda: [batched_steps(small, cells_of(few), batch, device)]),
-        (("episode",), lambda: [episode(few, dataclasses.replace(full, retina=small.retina), batch, device)]),
+        (("episode",), lambda: [episode(few, dataclasses.replace(full, retina=small.retina), batch, device, mode)]),
     ]
     if device == "cpu":
         builders += [

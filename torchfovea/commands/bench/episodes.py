@@ -15,7 +15,7 @@ from torchfovea.commands.bench.timing import Path, Peer, same
 from torchfovea.commands.shared.build import build_arena, build_cells, build_scene_of, number, whole
 from torchfovea.commands.shared.rollout import roll_out
 from torchfovea.deciding.weighted import Weighting
-from torchfovea.perception import Observer, Step, decide, new_memory, perceive
+from torchfovea.perception import Observer, Step, compiled, decide, new_memory, perceive
 from torchfovea.sensing.camera import image_camera
 from torchfovea.sensing.head import Gaze, eyes
 from torchfovea.sim import gl, rays
@@ -76,8 +76,8 @@ def photometric_saccade(cfg: DictConfig, observer: Observer) -> Path:
     return Path("saccade", work, "cpu", saccade, (), check)
 
 
-def episode(cfg: DictConfig, observer: Observer, batch: int, device: str) -> Path:
-    """Geometric episodes that advance together, and the same one by one."""
+def episode(cfg: DictConfig, observer: Observer, batch: int, device: str, compile: str = "off") -> Path:
+    """Geometric episodes that advance together, the same one by one, and, unless `compile` is off, compiled."""
     cfg = cfg.copy()
     cfg.device = device
     cfg.sensor.sample = None
@@ -95,12 +95,13 @@ def episode(cfg: DictConfig, observer: Observer, batch: int, device: str) -> Pat
             same("episode", ours.global_information[0], theirs.global_information[0], 1e-3)
 
     looks = whole(cfg, "saccades")
+    fast = partial(roll_out, cfg, compiled(observer, compile), seeds)
     return Path(
         "episode",
         f"of {looks} saccades, {observer.retina.count} RFs, {cfg.memory.cells} cells; {batch} together",
         device,
         together,
-        (Peer("one by one", alone),),
+        (Peer("one by one", alone), *(() if compile == "off" else (Peer("ours, compiled", fast),))),
         check,
         units=batch,
     )
