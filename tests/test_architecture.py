@@ -70,6 +70,7 @@ FLOORS = (
         "fields",
         "geometric",
         "marks",
+        "stripes",
         "pinhole",
         "triangulation",
         "association",

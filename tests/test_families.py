@@ -13,7 +13,7 @@ from torchfovea.perception import Eligibility, Observer, decide, new_memory
 from torchfovea.sensing.head import Head
 from torchfovea.tuning.scenes import draw_scenes, stream
 
-FAMILIES = ["narrow", "small", "far", "twins", "marked"]
+FAMILIES = ["narrow", "small", "far", "twins", "marked", "marked_images"]
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -23,10 +23,11 @@ def test_a_family_is_built_as_it_says(family):
     head = build_observer(cfg).head
     scene = build_scene_of(cfg, head, 1)
     again = build_scene_of(cfg, head, 1)
-    assert cfg.scene.name == family and head.baseline_m == 0.065
+    marked = family in ("marked", "marked_images")
+    assert cfg.scene.name == ("marked" if marked else family) and head.baseline_m == 0.065
     assert torch.equal(scene.nearest_point_e, again.nearest_point_e)
-    cans = cfg.scene.get("cans") if family == "marked" else cfg.scene
-    low, high = cans.range_m if family == "marked" else cans.target_range_m
+    cans = cfg.scene.get("cans") if marked else cfg.scene
+    low, high = cans.range_m if marked else cans.target_range_m
     assert low - 0.1 < scene.nearest_range_m < high and scene.nearest.geom in scene.target_geoms
     assert sum(solid.name.startswith("can_") for solid in scene.solids) == cans.cans
 

@@ -167,7 +167,7 @@ def test_mistakes_are_named(tmp_path, capsys):
     small = ["search", "family=marked", "episodes=1", "saccades=2", "memory.cells=60", "picture=false"]
     for settings, named in (
         (["reward.sought=9"], "sought = 9: expected a class that an object has, 1 to 3"),
-        (["fidelity=photometric"], "reward = of_class: expected fidelity=geometric"),
+        (["fidelity=photometric"], "reward = of_class: expected motion=still and fidelity=geometric"),
     ):
         assert main([*small, *settings, f"hydra.run.dir={tmp_path}/run"]) == 1
         assert named in capsys.readouterr().err

@@ -7,13 +7,15 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchfovea.memory.classes import Classes
 from torchfovea.memory.egosphere import Memory
 from torchfovea.memory.expected import hidden_beyond
 from torchfovea.perception import Observer
 from torchfovea.search import Look
-from torchfovea.sensing.correspondence import Disparity
+from torchfovea.sensing.correspondence import Correspondences, Disparity
 from torchfovea.sensing.fields import draw_fields, for_all
 from torchfovea.sensing.head import Eyes, to_ego
+from torchfovea.sensing.layout import Retina
 from torchfovea.setting import require
 from torchfovea.stereo.matchers import Match, Narrowed, checked_matches
 from torchfovea.stereo.sweep import SweepRange, Volume
@@ -53,9 +55,11 @@ def look_at(
         sample: how many receptive fields count, drawn anew each time; None: all of them.
 
     Raises:
-        SettingError: as the matcher does, and for a matcher that returns something else.
+        SettingError: as the matcher does, and for a matcher, or an evidence of classes, that returns something else.
     """
     matches, found = checked_matches(matcher(views, observer.retina, observer.budget), observer.retina)
+    if observer.classes is not None:
+        matches = matches._replace(classes=_told_of_classes(observer.classes, views, observer.retina, matches))
     if sample is not None:
         require(generator is not None, "generator", None, "a torch.Generator, which draws the sample")
         assert generator is not None
@@ -63,6 +67,19 @@ def look_at(
         if chosen is not None:
             matches = for_all(matches.take(chosen), observer.retina)
     return Look(matches, Pictures(views.left, views.right, found))
+
+
+def _told_of_classes(classes: Classes, views: Views, retina: Retina, matches: Correspondences) -> Tensor:
+    """What the pictures tell of each field's class, (N, K)."""
+    form = "a function (views, retina, matches) that tells classes in pictures"
+    require(classes.evidence is not None, "classes.evidence", None, form)
+    assert classes.evidence is not None
+    answer, shape = classes.evidence(views, retina, matches), (retina.count, classes.count)
+    fits = isinstance(answer, Tensor) and tuple(answer.shape) == shape and bool((answer > 0).all())
+    fits = fits and bool(answer.isfinite().all())
+    given = getattr(answer, "shape", type(answer).__name__)
+    require(fits, "classes.evidence", given, f"positive likelihoods {shape}, one row for each receptive field")
+    return answer
 
 
 def told(matcher: Match, observer: Observer, memory: Memory | None, eyes: Eyes) -> Match:

@@ -8,7 +8,9 @@ nothing changes nothing, however often it is repeated.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,7 +18,11 @@ from torch import Tensor
 from torchfovea.memory.association import Pairs
 from torchfovea.setting import require
 
-__all__ = ["Classes", "class_moments", "join_evidence", "new_classes"]
+__all__ = ["Classes", "Evidence", "class_moments", "join_evidence", "new_classes"]
+
+Evidence = Callable[[Any, Any, Any], Tensor]
+"""From views (`torchfovea.stereo.views.Views`), a retina and its matches to how likely what each field shows is for
+each class, (N, K)."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +34,13 @@ class Classes:
         sought: the class whose nearest member is the task.
         prior: concentration of an unseen cell's Dirichlet belief, summed over the classes; the smaller, the more one
             look counts.
+        evidence: what tells the classes in pictures; None: nothing does, the geometric sensor's marks aside.
     """
 
     count: int = 2
     sought: int = 1
     prior: float = 0.2
+    evidence: Evidence | None = None
 
     def __post_init__(self) -> None:
         """Raise SettingError for classes that are none."""
@@ -40,6 +48,8 @@ class Classes:
         inside = isinstance(self.sought, int) and 0 < self.sought < self.count
         require(inside, "sought", self.sought, f"a class that an object has, 1 to {self.count - 1}")
         require(1e-3 <= self.prior <= 1e3, "classes.prior", self.prior, "a concentration, 0.001 to 1000")
+        form = "a function (views, retina, matches) that returns likelihoods (N, K)"
+        require(self.evidence is None or callable(self.evidence), "evidence", type(self.evidence).__name__, form)
 
 
 def new_classes(classes: Classes, cells: Tensor) -> Tensor:

@@ -19,6 +19,7 @@ from torchfovea.sensing.geometric import correspond_points, with_noise
 from torchfovea.sensing.head import Gaze, clamp_gaze, cyclopean, eyes, to_ego
 from torchfovea.sensing.marks import field_width_rad, read_marks, readable
 from torchfovea.setting import require
+from torchfovea.sim.marked import check_marks
 from torchfovea.sim.model import Scene
 from torchfovea.sim.motor import InstantMotor, Motor
 from torchfovea.sim.room import FLOOR, TARGET
@@ -179,13 +180,7 @@ def _marks(scenes: Sequence[Scene], classes: Classes, most: int) -> tuple[Tensor
     """The class of every geom, (B, G), and the detail that tells them; scenes without such marks are refused."""
     rows, detail_m = [], 0.0
     for scene in scenes:
-        told = scene.marks
-        require(told is not None, "reward", "of_class", "a scene whose things bear marks, such as scene=marked")
-        assert told is not None
-        known = f"{told.classes}, the classes of the scene"
-        require(classes.count == told.classes, "reward.count", classes.count, known)
-        here = f"{told.sought}, the class of the scene's target"
-        require(classes.sought == told.sought, "reward.sought", classes.sought, here)
+        told = check_marks(scene, classes)
         require(detail_m in (0.0, told.detail_m), "scene.detail_m", told.detail_m, f"{detail_m}, as in the others")
         rows.append(pad(told.of_geom, (0, most - len(told.of_geom))))
         detail_m = told.detail_m

@@ -58,7 +58,10 @@ _METAL = (0.40, 0.41, 0.44)
 
 @dataclass(frozen=True)
 class Solid:
-    """One geom: `size` are half lengths for a box, (radius, half height) for a cylinder, (radius,) for a sphere [m]."""
+    """One geom: `size` are half lengths for a box, (radius, half height) for a cylinder, (radius,) for a sphere [m].
+
+    `stripes` are a mark on a label (`torchfovea.sim.texture.Paint`).
+    """
 
     name: str
     kind: int
@@ -70,6 +73,7 @@ class Solid:
     accent: tuple[float, float, float] = (0.5, 0.5, 0.5)
     contrast: float = 1.0
     label: bool = field(default=False)
+    stripes: tuple[float, float, float] = (0.0, 0.0, 0.0)
     repeat_m: float = math.inf
 
 
@@ -204,5 +208,6 @@ def paint_solids(solids: Sequence[Solid], rng: np.random.Generator) -> Paint:
         offset=columns(rng.uniform(0, 20, (len(solids), 3)).tolist()),
         centre=columns(s.position_m for s in solids),
         can=columns(s.size_m[:2] if s.label else (0.0, 0.0) for s in solids),
+        stripes=columns(s.stripes for s in solids),
         repeat_m=torch.tensor([s.repeat_m for s in solids], dtype=torch.float32),
     )

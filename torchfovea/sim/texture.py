@@ -42,6 +42,8 @@ class Paint(NamedTuple):
         offset: (3, G), its place in the noise, added to world coordinates [m].
         centre: (3, G), in the world [m].
         can: (2, G), radius and half height of an upright can's label [m]; 0 for everything else.
+        stripes: (3, G), a mark on a can in place of its label's wave: periods around it, periods per metre of height,
+            and contrast; 0 for none.
         repeat_m: (G,), after which the noise repeats along each axis of the world; inf: never.
     """
 
@@ -49,6 +51,7 @@ class Paint(NamedTuple):
     offset: Tensor
     centre: Tensor
     can: Tensor
+    stripes: Tensor
     repeat_m: Tensor
 
 
@@ -129,8 +132,8 @@ def _log_albedo(point: Tensor, spread: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return value, power, coarse[3]
 
 
-def _label(local: Components, size: Tensor, footprint: Tensor, base: Tensor) -> Tensor:
-    """A can's albedo (3, R, C): its own colour with a white wave around it, metal at both ends."""
+def _label(local: Components, size: Tensor, stripes: Tensor, footprint: Tensor, base: Tensor) -> Tensor:
+    """A can's albedo (3, R, C): its own colour with a white wave around it, or with stripes, and metal at both ends."""
     half = size[1]
     x, y, z = local
     angle = torch.atan2(y, x)
@@ -143,6 +146,13 @@ def _label(local: Components, size: Tensor, footprint: Tensor, base: Tensor) -> 
 
     wave = 0.34 * torch.sin(angle + 0.9 * torch.sin(2 * angle))
     ribbon = torch.maximum(inside(0.13 - (height - wave).abs()), inside(0.02 - (height - wave - 0.24).abs()))
+    around, up, contrast = stripes
+    striped = contrast > 0
+    if bool(striped.any()):
+        ribbon = torch.where(striped, 0, ribbon)
+        frequency = (around / (2 * math.pi * size[0])).square() + up.square()
+        fade = torch.exp(-2 * (math.pi * _PIXEL_SIGMA * footprint).square() * frequency)
+        base = base * (1 + contrast * fade * torch.sin(around * angle + 2 * math.pi * up * z))
     metal = inside(height.abs() - 0.9)
     white, silver = (base.new_tensor(c)[:, None, None] for c in (_WHITE, _SILVER))
     albedo = base + ribbon * (white - base)
@@ -188,11 +198,11 @@ def colour(paint: Paint, geom: Tensor, point: Components, normal: Components, fo
     rows = (told(paint.can[0]).amax(1) > 0).nonzero()[:, 0]
     if len(rows) > 0:
         own = geom.index_select(0, rows)
-        size = paint.can[:, own]
+        size, stripes = paint.can[:, own], paint.stripes[:, own]
         local = [part.index_select(0, rows) - c[own] for part, c in zip(point, paint.centre, strict=True)]
         base, canned = albedo.index_select(1, rows), size[0] > 0
         size = torch.where(canned, size, 1)
-        label = _label((local[0], local[1], local[2]), size, footprint_m.index_select(0, rows), base)
+        label = _label((local[0], local[1], local[2]), size, stripes, footprint_m.index_select(0, rows), base)
         albedo.index_copy_(1, rows, torch.where(canned, label, base))
     contrast = told(paint.look[6])
     # the mean of exp(noise) shrinks as octaves fade; put it back, or far walls would darken

@@ -23,7 +23,7 @@ from torchfovea.commands.search.remembering import (
     rounds,
     write_bias,
 )
-from torchfovea.commands.shared.build import build_observer, build_route
+from torchfovea.commands.shared.build import build_observer, build_route, check_readable
 from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.figures import EPISODE_COLUMNS, episode_row
 from torchfovea.commands.shared.manifest import complete, finished
@@ -57,8 +57,8 @@ def run(cfg: DictConfig) -> float:
     episodes, saccades, seed = whole(cfg, "episodes"), whole(cfg, "saccades"), whole(cfg, "seed", 0)
     observer = build_observer(cfg)
     choice(cfg, "fidelity", ("photometric", "geometric"))
-    reads = observer.classes is None or batched(cfg)
-    require(reads, "reward", "of_class", "fidelity=geometric motor=instant, whose receptive fields read marks")
+    if not batched(cfg):
+        check_readable(cfg, observer)
     device_of(cfg), whole(cfg, "batch"), workers_of(cfg)
     require(isinstance(cfg.picture, bool), "picture", cfg.picture, "true or false")
     require(isinstance(cfg.record, bool), "record", cfg.record, "true or false")

@@ -32,7 +32,8 @@ def sensors_of(cfg: DictConfig, observer: Observer) -> Sensors:
     """
     found = both_sensors(cfg, observer.retina)
     if found:
-        require(observer.classes is None, "figure1", True, "false with reward=of_class, whose marks no picture has")
+        shown = observer.classes is None or cfg.fidelity == "photometric"
+        require(shown, "figure1", True, "false with reward=of_class and fidelity=geometric, whose marks no picture has")
         still = name_of(cfg, "motion") == "still"
         require(still, "figure1", True, "false with a base that moves, motion=path")
     ours = cfg.sensor.layout

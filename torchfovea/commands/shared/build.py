@@ -24,6 +24,7 @@ from torchfovea.sensing.own_layout import check_retina
 from torchfovea.sensing.unscented import SigmaPoints
 from torchfovea.setting import SettingError, require
 from torchfovea.sim.arena import SimulatedArena
+from torchfovea.sim.marked import check_marks
 from torchfovea.sim.motor import Motor
 from torchfovea.sim.noise import ImageNoise
 from torchfovea.sim.rays import Renderer
@@ -49,6 +50,7 @@ __all__ = [
     "build_route",
     "build_scene_of",
     "build_sensor",
+    "check_readable",
     "choice",
     "construct",
     "name_of",
@@ -195,8 +197,10 @@ def build_motor(cfg: DictConfig) -> Callable[[Scene], Motor]:
 
 def build_arena(cfg: DictConfig, observer: Observer, seed: int) -> SimulatedArena:
     """The simulated world of an episode."""
-    require(observer.classes is None, "reward", "of_class", "fidelity=geometric motor=instant in search, to read marks")
+    check_readable(cfg, observer)
     scene = build_scene_of(cfg, observer.head, seed)
+    if observer.classes is not None:
+        check_marks(scene, observer.classes)
     fidelity = choice(cfg, "fidelity", ("photometric", "geometric"))
     world = World(
         scene,
@@ -212,6 +216,18 @@ def build_arena(cfg: DictConfig, observer: Observer, seed: int) -> SimulatedAren
     sample = None if OmegaConf.select(cfg, "sensor.sample") is None else whole(cfg, "sensor.sample", 16)
     geometric, route = fidelity == "geometric", build_route(cfg)
     return SimulatedArena(world, observer, None if geometric else match, sample, seed, route)
+
+
+def check_readable(cfg: DictConfig, observer: Observer) -> None:
+    """Refuse a search for a class that one world's sensor cannot tell; those of many rows read marks themselves.
+
+    Raises:
+        SettingError: for pictures that nothing reads, for none, and for a base that moves.
+    """
+    seen = choice(cfg, "fidelity", ("photometric", "geometric")) == "photometric" and build_route(cfg) is None
+    reads = observer.classes is None or (seen and observer.classes.evidence is not None)
+    expected = "motion=still and fidelity=geometric motor=instant in search, or pictures and reward.evidence"
+    require(reads, "reward", "of_class", expected)
 
 
 def build_route(cfg: DictConfig) -> Route | None:

@@ -28,11 +28,12 @@ BESIDES = {
     "null": "noise pair bag.camera sensor.sample mine entries",
     "int": (
         "memory.cells sensor.sample distances vergences propagation.samples every acquisition.saccades "
-        "against threads episodes scenes judged_scenes looks validation_scenes heldout_scenes check_episodes"
+        "against threads episodes scenes judged_scenes looks validation_scenes heldout_scenes check_episodes "
+        "reward.evidence.marks"
     ),
     "float": (
         "calibration_unit_m focal_px cx_px cy_px baseline_m disparity_unit_px disparity_unknown "
-        "stop.probability seconds"
+        "stop.probability seconds reward.evidence.detail_m"
     ),
     "str": (
         "pair matcher.source study viewer families paths tracks report conditions arms size resume recording "
@@ -44,6 +45,7 @@ BESIDES = {
     "list[float]": "gaze_px gaze_right_px fovs_deg",
     "list[str]": "families paths report pairs overrides scene_overrides.attention_world",
     "list[map]": "mine",
+    "map": "reward.evidence",
 }
 WORDS = {"bool": "true or false", "int": "a whole number", "float": "a number", "str": "text", "map": "a mapping"}
 

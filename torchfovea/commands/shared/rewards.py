@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -15,10 +16,12 @@ from torchfovea.commands.shared.settings import construct
 from torchfovea.deciding import reward
 from torchfovea.memory.classes import Classes
 from torchfovea.setting import require
+from torchfovea.stereo.stripes import Stripes
 
 __all__ = ["build_classes", "build_reward", "nearest_to"]
 
 FORM = "a function of points (..., 3) [m] that returns a reward (...) for each"
+EVIDENCE = "a function (views, retina, matches) that returns likelihoods (N, K)"
 
 
 def nearest_to(point: Any) -> Callable[[Tensor], Tensor]:
@@ -63,5 +66,12 @@ def build_classes(cfg: DictConfig) -> Classes | None:
     """
     if name_of(cfg, "reward") != "of_class":
         return None
-    settings = {str(key): value for key, value in cfg.reward.items() if key not in ("name", "_target_")}
-    return construct(Classes, settings, "reward")
+    settings = {str(key): value for key, value in cfg.reward.items() if key not in ("name", "_target_", "evidence")}
+    classes = construct(Classes, settings, "reward")
+    if cfg.reward.get("evidence") is None:
+        return classes
+    made = build_named(cfg, "reward.evidence", EVIDENCE, ())
+    require(callable(made), "reward.evidence", type(made).__name__, EVIDENCE)
+    known = made.marks + 1 if isinstance(made, Stripes) else classes.count
+    require(classes.count == known, "reward.count", classes.count, f"{known}, one more than reward.evidence's marks")
+    return replace(classes, evidence=made)
