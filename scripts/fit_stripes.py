@@ -23,7 +23,7 @@ from torchfovea.commands.shared.build import build_arena, build_observer
 from torchfovea.commands.shared.config import conf_dir
 from torchfovea.sensing.head import fixate
 from torchfovea.stereo.rig import rig_at
-from torchfovea.stereo.stripes import Shown, Stripes
+from torchfovea.stereo.stripes import Stripes, StripesShown
 from torchfovea.stereo.views import verged_views
 
 SEED = 90000
@@ -31,7 +31,7 @@ COLOUR = {"redness": (0.0, 100.0), "red": (0.0, 1.0)}
 WIDTHS = (0.0, 0.3, 0.5, 0.7, 0.9, 1.2, 1.5, 2.0, 3.0)  # of the fields, in stripes
 
 
-def looks(cfg: DictConfig, stripes: Stripes, seed: int) -> list[tuple[Shown, Tensor]]:
+def looks(cfg: DictConfig, stripes: Stripes, seed: int) -> list[tuple[StripesShown, Tensor]]:
     """What matched fields show at each can of a scene, somewhere on it, and its class."""
     observer = build_observer(cfg)
     arena = build_arena(cfg, observer, seed)
@@ -51,14 +51,14 @@ def looks(cfg: DictConfig, stripes: Stripes, seed: int) -> list[tuple[Shown, Ten
         shown = frames[0].geom[row.clamp(0, side), column.clamp(0, side)]
         good = matches.valid & (shown >= 0)
         seen = stripes.see(views, retina, matches)
-        found.append((Shown(*(part[good].double() for part in seen)), scene.marks.of_geom[shown[good]]))
+        found.append((StripesShown(*(part[good].double() for part in seen)), scene.marks.of_geom[shown[good]]))
     return found
 
 
-def gather(cfgs: list[DictConfig], stripes: Stripes, seeds: range) -> tuple[Shown, Tensor]:
+def gather(cfgs: list[DictConfig], stripes: Stripes, seeds: range) -> tuple[StripesShown, Tensor]:
     """All looks with all retinas."""
     seen, shown = zip(*(look for seed in seeds for cfg in cfgs for look in looks(cfg, stripes, seed)), strict=True)
-    return Shown(*(torch.cat(parts) for parts in zip(*seen, strict=True))), torch.cat(shown)
+    return StripesShown(*(torch.cat(parts) for parts in zip(*seen, strict=True))), torch.cat(shown)
 
 
 def nats(log_likelihood: Tensor, shown: Tensor) -> Tensor:
@@ -68,7 +68,7 @@ def nats(log_likelihood: Tensor, shown: Tensor) -> Tensor:
     return torch.stack([told[shown == k].mean() for k in range(count) if (shown == k).any()]).mean() + math.log(count)
 
 
-def fit(stripes: Stripes, seen: Shown, shown: Tensor, bounds: dict[str, tuple[float, float]]) -> Stripes:
+def fit(stripes: Stripes, seen: StripesShown, shown: Tensor, bounds: dict[str, tuple[float, float]]) -> Stripes:
     """The same with the numbers, of these ranges, that make the classes most likely."""
 
     def cost(numbers: np.ndarray) -> float:

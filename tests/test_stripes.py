@@ -20,7 +20,7 @@ from torchfovea.sensing.retina import fovea
 from torchfovea.setting import SettingError
 from torchfovea.sim.texture import Paint, colour
 from torchfovea.stereo.rig import verged
-from torchfovea.stereo.stripes import Shown, Stripes, direction_votes
+from torchfovea.stereo.stripes import Stripes, StripesShown, direction_votes
 from torchfovea.stereo.views import verged_views
 
 SIDE = 256  # of the images
@@ -76,7 +76,7 @@ def test_the_likelihood_is_as_it_says():
     rng = np.random.default_rng(0)
     votes, red, width = rng.uniform(-0.7, 0.7, (20, 2)), rng.uniform(0, 1, 20), rng.uniform(0, 0.03, 20)
     width[0] = np.inf
-    found = stripes.likelihood(Shown(*(torch.tensor(part) for part in (votes, red, width))))
+    found = stripes.likelihood(StripesShown(*(torch.tensor(part) for part in (votes, red, width))))
     for n in range(20):
         wanted = [1.0]
         for mark in (1, 2, 3):

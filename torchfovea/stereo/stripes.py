@@ -21,13 +21,13 @@ from torchfovea.sensing.triangulation import triangulate
 from torchfovea.setting import require
 from torchfovea.stereo.views import Views
 
-__all__ = ["Shown", "Stripes", "direction_votes"]
+__all__ = ["Stripes", "StripesShown", "direction_votes"]
 
 _SIDE = 9  # places a side around a field
 _FAINT = 1e-3  # squared differences, in shares of the brightness, that are noise
 
 
-class Shown(NamedTuple):
+class StripesShown(NamedTuple):
     """What N receptive fields show.
 
     Attributes:
@@ -80,7 +80,7 @@ class Stripes:
         """What the left eye's picture tells of each field, (N, n + 1)."""
         return self.likelihood(self.see(views, retina, matches))
 
-    def see(self, views: Views, retina: Retina, matches: Correspondences) -> Shown:
+    def see(self, views: Views, retina: Retina, matches: Correspondences) -> StripesShown:
         """What the left eye's fields show; how far that is, and so how wide they are on it, the matches say."""
         colour = views.fovea(views.colour()[:1], retina)[0]
         px, cameras, turns = matches[:2], views.cameras(retina), views.rig[:2]
@@ -92,13 +92,13 @@ class Stripes:
         # places half a stripe apart, where the fields are no wider
         step_px = (retina.width_px(px[0]).square() + views.scale(retina) ** -2).sqrt()
         step_px = step_px * (self.detail_m / 2 / width_m).clamp(min=1)
-        return Shown(direction_votes(colour, self.is_marked(colour), retina, step_px), _red(colour), width_m)
+        return StripesShown(direction_votes(colour, self.is_marked(colour), retina, step_px), _red(colour), width_m)
 
     def is_marked(self, colour: Tensor) -> Tensor:
         """Probability that what has colours (3, ...) bears a mark, by their red alone, if half of all things do."""
         return (self.redness * (_red(colour) - self.red)).sigmoid()
 
-    def likelihood(self, seen: Shown) -> Tensor:
+    def likelihood(self, seen: StripesShown) -> Tensor:
         """Of what fields show, under every class (N, n + 1). Differentiable."""
         votes = seen.votes
         angle = 2 * math.pi * (torch.arange(self.marks, dtype=votes.dtype, device=votes.device) + 0.5) / self.marks
