@@ -33,7 +33,7 @@ BESIDES = {
     ),
     "float": (
         "calibration_unit_m focal_px cx_px cy_px baseline_m disparity_unit_px disparity_unknown "
-        "stop.probability seconds reward.evidence.detail_m"
+        "stop.probability seconds reward.evidence.detail_m matcher.half_from_px"
     ),
     "str": (
         "pair matcher.source study viewer families paths tracks report conditions arms size resume recording "
