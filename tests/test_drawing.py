@@ -47,8 +47,6 @@ def test_the_picture_that_rays_draw(scenes, camera, gaze):
         assert same.double().mean() > 0.9995
         away = (frame.range_m.double() - hits.range_m.view(SIZE, SIZE)).abs()[same]
         assert away.max() < 2e-5 and away.median() < 1e-6
-        turned = (frame.normal.double() - hits.normal.view(SIZE, SIZE, 3)).abs().amax(-1)[same]
-        assert turned.quantile(0.999) < 1e-4
         error = (frame.image - image).abs().amax(0)[same]
         # a two hundredth of white where a texture is cut off, nothing elsewhere
         assert error.median() < 1e-4 and error.quantile(0.99) < 3e-3 and error.max() < 0.015
@@ -126,7 +124,6 @@ def test_both_eyes_are_drawn_at_once(scenes):
     for a, b in zip(named, each, strict=True):
         assert torch.equal(a.geom, b.geom)
         assert (a.image - b.image).abs().quantile(0.999) < 2e-3
-        assert (a.normal - b.normal).abs().quantile(0.999) < 1e-4
 
 
 def test_with_and_without_opencv(scenes, monkeypatch):

@@ -155,7 +155,6 @@ def test_a_picture_is_its_pixels_rays(scene, camera):
     hits = cast(scene, pose.t_left, camera.rays(px) @ pose.R_left.mT)
     assert torch.equal(frame.geom[rows, columns], hits.geom)
     assert torch.allclose(frame.range_m[rows, columns].double(), hits.range_m, rtol=1e-5)
-    assert torch.allclose(frame.normal[rows, columns].double(), hits.normal, atol=1e-5)
     assert frame.image.shape == (3, 61, 61) and frame.image.dtype == torch.float32
     assert frame.image.min() >= 0 and frame.image.max() <= 1
 
@@ -202,7 +201,8 @@ def test_texture_is_filtered_to_the_pixel(scene):
     v, u = torch.meshgrid(index, index, indexing="ij")
     ray = image_camera(Pinhole.from_fov(90, 100), 100, size).rays(torch.stack([u, v], -1))
     way = torch.nn.functional.normalize(ray, dim=-1) @ pose.R_left.mT
-    facing = (way * coarse.normal.double()).sum(-1).abs() > 0.8
+    normal = cast(scene, pose.t_left, way.flatten(0, 1)).normal.view_as(way)
+    facing = (way * normal).sum(-1).abs() > 0.8
     keep = whole & facing
     assert keep.double().mean() > 0.2
     a, b = mean[:, keep].flatten(), coarse.image[:, keep].flatten()

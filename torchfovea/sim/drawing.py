@@ -61,13 +61,11 @@ class Drawn(NamedTuple):
         image: (B, 3, H, W) RGB in [0, 1].
         range_m: (B, H, W) along each pixel's ray, infinite where it meets nothing.
         geom: (B, H, W) int64, -1 for a miss.
-        normal: (B, 3, H, W) in the world.
     """
 
     image: Tensor
     range_m: Tensor
     geom: Tensor
-    normal: Tensor
 
 
 class _Pixels(NamedTuple):
@@ -293,15 +291,13 @@ def draw_pictures(scenes: Painted, rotation: Tensor, eye: Tensor, camera: Camera
     if bool((scenes.geom[:_FACES] < 0).any()):
         missed = geom < 0
         rgb = torch.where(missed, rgb.new_tensor(_SKY)[:, None, None], rgb)
-        nx, ny, nz = (part.masked_fill(missed, 0) for part in (nx, ny, nz))
         met.range_m.masked_fill_(missed, torch.inf)
 
     side = -(-size_px // _TILE)
 
     def whole(part: Tensor) -> Tensor:  # (..., B · T, 64) to (B, ..., H, W)
         lead = part.shape[:-2]
-        part = part.view(*lead, count, side, side, _TILE, _TILE).transpose(-2, -3)
-        part = part.reshape(*lead, count, side * _TILE, side * _TILE)[..., :size_px, :size_px]
-        return part.movedim(-3, 0).contiguous()
+        part = part.view(*lead, count, side, side, _TILE, _TILE).transpose(-2, -3).movedim(-5, 0)
+        return part.reshape(count, *lead, side * _TILE, side * _TILE)[..., :size_px, :size_px].contiguous()
 
-    return Drawn(whole(rgb), whole(met.range_m), whole(geom), whole(torch.stack([nx, ny, nz])))
+    return Drawn(whole(rgb), whole(met.range_m), whole(geom))

@@ -222,7 +222,7 @@ def opengl() -> Renderer:
 
 
 def render(scene: Scene, R: Tensor, t: Tensor, camera: Camera, size_px: int) -> Frame:
-    """A square picture by OpenGL; its arguments and frame are `torchfovea.sim.rays.render`'s, but the normals are zero.
+    """A square picture by OpenGL; its arguments and frame are `torchfovea.sim.rays.render`'s.
 
     The first picture of a scene bakes its textures (seconds). One thread only.
 
@@ -253,5 +253,4 @@ def render(scene: Scene, R: Tensor, t: Tensor, camera: Camera, size_px: int) -> 
         torch.from_numpy(rgb.copy()).permute(2, 0, 1).float() / 255,
         torch.where(label >= 0, range_m, torch.full_like(range_m, MISS_RANGE_M)).float(),
         label,
-        torch.zeros(size_px, size_px, 3),
     )

@@ -49,13 +49,11 @@ class Frame(NamedTuple):
         image: (3, H, W) RGB in [0, 1], float32.
         range_m: (H, W) distance from the camera's centre along each pixel's ray, MISS_RANGE_M for a miss.
         geom: (H, W) int64, -1 for a miss.
-        normal: (H, W, 3) in E.
     """
 
     image: Tensor
     range_m: Tensor
     geom: Tensor
-    normal: Tensor
 
 
 @runtime_checkable
@@ -201,7 +199,5 @@ def render_together(scenes: Sequence[Scene], R: Tensor, t: Tensor, camera: Camer
     turn = rotation @ R.detach().double()
     eye = (rotation @ t.detach().to(R.device).double()[..., None])[..., 0] + translation
     drawn = draw_pictures(_paint(scenes, R.device), turn, eye, camera, size_px)
-    normal = rotation.float().mT @ drawn.normal.flatten(2)
-    normal = normal.view(-1, 3, size_px, size_px).permute(0, 2, 3, 1)
     range_m = drawn.range_m.clamp(max=MISS_RANGE_M)
-    return [Frame(*parts) for parts in zip(drawn.image, range_m, drawn.geom, normal, strict=True)]
+    return [Frame(*parts) for parts in zip(drawn.image, range_m, drawn.geom, strict=True)]
