@@ -33,14 +33,16 @@ class Sheet(NamedTuple):
         width_px: (R, S), the larger of the RF's width there and a source pixel.
         closed: whether the last column neighbours the first.
         rf: (n,) int64, the RFs answered for.
-        place: (n, 2), their columns and rows on the grid; whole numbers where a cell is the RF itself.
+        cells: (4, n) int64, the cells around each RF, or (1, n) where every RF is a cell itself; the nearest one first.
+        share: (4, n) or (1, n), their bilinear weights.
     """
 
     px: Tensor
     width_px: Tensor
     closed: bool
     rf: Tensor
-    place: Tensor
+    cells: Tensor
+    share: Tensor
 
 
 @lru_cache(maxsize=16)
@@ -67,9 +69,21 @@ def sheets(retina: Retina, source_pitch_px: float, device: torch.device, dtype: 
         for px, closed, rf, place in parts:
             grid = columns(*(torch.from_numpy(np.ascontiguousarray(c)) for c in px))
             width = retina.width_px(grid).clamp(min=source_pitch_px)
-            grid, width, where = (a.to(device, dtype) for a in (grid, width, torch.from_numpy(place)))
-            out.append(Sheet(grid, width, closed, torch.from_numpy(rf).to(device), where))
+            cells, share = _around(place, (grid.shape[0], grid.shape[1]))
+            grid, width, share = (a.to(device, dtype) for a in (grid, width, share))
+            out.append(Sheet(grid, width, closed, torch.from_numpy(rf).to(device), cells.to(device), share))
     return tuple(out)
+
+
+def _around(place: np.ndarray, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Cells of a grid, rows and columns, around places (n, 2), columns and rows, and their weights; see `Sheet`."""
+    last = np.array(size)[::-1] - 1
+    nearest = np.minimum(np.round(place), last)
+    steps = np.array([(0, 0), (1, 0), (0, 1), (1, 1)] if (nearest != place).any() else [(0, 0)])
+    at = nearest + steps[:, None] * np.where(place < nearest, -1, 1)
+    share = np.clip(1 - np.abs(place - at), 0, 1).prod(-1)
+    column, row = np.moveaxis(np.clip(at, 0, last), -1, 0)
+    return torch.from_numpy((row * size[1] + column).astype(np.int64)), torch.from_numpy(share)
 
 
 Part = tuple[tuple[np.ndarray, np.ndarray], bool, np.ndarray, np.ndarray]
@@ -140,24 +154,18 @@ def read_sheet(sheet: Sheet, values: Tensor, guide: Tensor, valid: Tensor, edge:
     Returns:
         (B, C, n), 0 where invalid, and bool (B, n). Differentiable in the values.
     """
-    rows, columns_ = sheet.px.shape[:2]
-    size = sheet.place.new_tensor([columns_ - 1, rows - 1])
-    near = torch.minimum(sheet.place.round(), size).long()
-    index = near[:, 1] * columns_ + near[:, 0]
     values, guide, valid, edge = values.flatten(-2), guide.flatten(-2), valid.flatten(-2), edge.flatten(-2)
-    found, reference, limit = valid[:, index], guide[:, index], edge[:, index]
-    corner = sheet.place.floor()
-    if bool((corner == sheet.place).all()):
-        return values[..., index] * found[:, None], found
-    total, out = torch.zeros_like(reference), torch.zeros_like(values[..., index])
-    for dx in (0, 1):
-        for dy in (0, 1):
-            at = corner + corner.new_tensor([dx, dy])
-            cell = torch.minimum(at, size).long()
-            cell = cell[:, 1] * columns_ + cell[:, 0]
-            weight = (1 - (sheet.place - at).abs()).clamp(min=0).prod(-1)
-            weight = weight * (found & valid[:, cell] & ((guide[:, cell] - reference).abs() <= limit))
-            total, out = total + weight, out + weight[:, None] * values[..., cell]
+    nearest, *others = sheet.cells
+    found, reference, limit = (part[:, nearest] for part in (valid, guide, edge))
+    first = values[..., nearest]
+    if not others:
+        return first * found[:, None], found
+    total = sheet.share[0] * found
+    out = total[:, None] * first
+    for cell, share in zip(others, sheet.share[1:], strict=True):
+        near = (guide[:, cell] - reference).abs() <= limit
+        weight = share * (found & valid[:, cell] & near)
+        total, out = total + weight, out + weight[:, None] * values[..., cell]
     return out / torch.where(found, total, torch.ones_like(total))[:, None], found
 
 
