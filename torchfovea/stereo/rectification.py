@@ -131,8 +131,8 @@ class RectifiedPair(NamedTuple):
         """Where the left eye looks, bool (H, W), or so many source pixels beyond its rim; None: everywhere."""
         if self.retina is None:
             return None
-        near = self.retina.inside(left_px * (1 - 2 * slack_px / self.views.source_px))
-        return near & ahead & self.views.holds(left_px, self.retina, slack_px + 0.5)
+        near = self.retina.inside(left_px * (1 - 2 * slack_px / self.views.source_px)) & ahead
+        return near if self.views.framed else near & self.views.holds(left_px, self.retina, slack_px + 0.5)
 
 
 def image_frame(views: Views, retina: Retina | None) -> RectifiedPair:

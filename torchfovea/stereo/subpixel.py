@@ -166,9 +166,13 @@ def _spaced(values: Tensor, closed: bool) -> Tensor:
     """Means over 3 × 3 cells that are `WIDE` cells apart."""
     for dim, around in ((-2, False), (-1, closed)):
         size = values.shape[dim]
-        at = torch.arange(size, device=values.device)
-        sides = [(at + k) % size if around else (at + k).clamp(0, size - 1) for k in (-WIDE, WIDE)]
-        values = (values + values.index_select(dim, sides[0]) + values.index_select(dim, sides[1])) / 3
+        if around:
+            first, last = values.narrow(dim, 0, WIDE), values.narrow(dim, size - WIDE, WIDE)
+            wide = torch.cat([last, values, first], dim)
+        else:
+            first, last = values.narrow(dim, 0, 1), values.narrow(dim, size - 1, 1)
+            wide = torch.cat([*(first,) * WIDE, values, *(last,) * WIDE], dim)
+        values = (values + wide.narrow(dim, 0, size) + wide.narrow(dim, 2 * WIDE, size)) / 3
     return values
 
 

@@ -59,6 +59,12 @@ class Views(NamedTuple):
         """What a retina spans [px]: the images' shorter side, if nothing else is said."""
         return min(self.left.shape[-2:]) if self.span_px is None else self.span_px
 
+    @property
+    def framed(self) -> bool:
+        """Whether all that the left retina spans is on the image."""
+        sides = zip(self.gaze_px, self.left.shape[:-3:-1], strict=True)
+        return all(abs(at - (side - 1) / 2) <= (side - self.source_px) / 2 for at, side in sides)
+
     def whole(self) -> Views:
         """The same, with retinas that span all of the images, whatever pixel they look at."""
         height, width = self.left.shape[-2:]

@@ -12,6 +12,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchfovea.gaussian import columns
 from torchfovea.sensing.retina import Retina
 from torchfovea.stereo.sheets import average
 
@@ -39,10 +40,10 @@ def outdone(
     Returns:
         bool (B, N); and by how much the farthest rival's disparity differs, outdone or not, (B, N) in cells, 0: none.
     """
-    rows, columns = shape
+    rows, across = shape
     column, row = cell.unbind(-1)
-    valid = valid & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-    width = columns + 2 * NEAR
+    valid = valid & (column >= 0) & (column < across) & (row >= 0) & (row < rows)
+    width = across + 2 * NEAR
     none, size = rows * width + NEAR, rows * width + 2 * NEAR + 1
     every = torch.arange(len(valid), device=valid.device)[:, None] * size
     index = (torch.where(valid, row * width + column + NEAR, none) + every).flatten()
@@ -95,8 +96,10 @@ def undisputed(left: Tensor, right: Tensor, disparity: Tensor, valid: Tensor, st
     x = torch.arange(width, device=left.device, dtype=left.dtype)
     there = (x - disparity).clamp(0, width - 1)
     first = there.floor().clamp(max=width - 2)
-    part, first = there - first, first.long()
-    like = torch.lerp(right.gather(1, first), right.gather(1, first + 1), part)
+    row = torch.arange(height, device=left.device)[:, None]
+    index, flat = (first.long() + width * row).flatten(), right.flatten()
+    one, other = (flat.index_select(0, index + k).view_as(left) for k in (0, 1))
+    like = torch.lerp(one, other, there - first)
     weight = valid.to(left)
     if valid.count_nonzero() < 2:
         return valid, torch.zeros_like(disparity)
@@ -106,10 +109,9 @@ def undisputed(left: Tensor, right: Tensor, disparity: Tensor, valid: Tensor, st
     square = (mine - gain * theirs).square()
     misfit = average(torch.stack([square * weight, weight]), 1, False)
     misfit = misfit[0] / misfit[1].clamp(min=1e-6)
-    row = torch.arange(height, device=left.device)[:, None].expand(-1, width)
-    cell = torch.stack([(x - disparity).round().long(), row], -1)
-    flat, share, claim = (part.view(1, -1) for part in (disparity, misfit, valid))
-    lost, rivals = outdone(cell.view(1, -1, 2), (height, width), flat, share, claim, step)
+    cell = columns((x - disparity).round().long().view(1, -1), row.expand(-1, width).reshape(1, -1))
+    shift, share, claim = (part.view(1, -1) for part in (disparity, misfit, valid))
+    lost, rivals = outdone(cell, (height, width), shift, share, claim, step)
     return valid & ~lost.view_as(valid), rivals.view_as(disparity)
 
 
