@@ -302,7 +302,8 @@ def test_one_row_s_bad_action_is_refused_before_any_row_moves():
         ({"saccades": 1}, "saccades = 1: expected at least 2"),
         ({"scenes": []}, "scenes = "),
         ({"reward": 2}, "reward = 2: expected a setting of the environment"),
-        ({"gap": math.nan}, "gap = nan: expected a finite weight"),
+        ({"gap": math.nan}, "gap = nan: expected a number"),
+        ({"gap": math.inf}, "gap = inf: expected a finite weight"),
         ({"action": "turn"}, "action = turn"),
     ],
 )

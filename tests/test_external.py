@@ -260,7 +260,7 @@ def test_bad_answers_and_settings_are_named(tmp_path, disparity, images, views):
     for source, message in (
         (answer(disparity), r"disparity\.shape"),
         (3, "a function"),
-        (tmp_path / "d.npz", "a file has the disparity of a rectified pair"),
+        (tmp_path / "d.npz", "for a rectified pair, a disparity file"),
     ):
         with pytest.raises(SettingError, match=message):
             match_external(source, eyes, LogPolar(800))

@@ -125,7 +125,7 @@ def test_centers_keep_device_dtype_and_work_after_inference():
     [
         (lambda: LogPolar(212), "receptive_fields = 212"),
         (lambda: LogPolar(3), "receptive_fields = 3"),
-        (lambda: LogPolar(1000.0), "receptive_fields = 1000.0"),
+        (lambda: LogPolar(1000.5), "receptive_fields = 1000.5"),
         (lambda: LogPolar(radius_px=0), "radius_px = 0"),
         (lambda: LogPolar(rho_min_px=100), "rho_min_px = 100"),
         (lambda: LogPolar(rho_min_px=-1), "rho_min_px = -1"),

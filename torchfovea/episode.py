@@ -21,7 +21,7 @@ from torchfovea.perception import Observer, Step
 from torchfovea.rows import row, stack
 from torchfovea.search import Glance, Look, StopRule, search
 from torchfovea.sensing.head import Gaze, gaze_point
-from torchfovea.setting import require
+from torchfovea.setting import check_types, require
 
 __all__ = ["Each", "Episode", "Rules", "run_episode", "run_episodes"]
 
@@ -94,6 +94,7 @@ class Rules:
 
     def __post_init__(self) -> None:
         """Raise SettingError for no saccades, or distances that are none."""
+        check_types(self)
         require(self.saccades >= 1, "saccades", self.saccades, "at least 1")
         for name in ("far_m", "near_target_m"):
             require(0 < getattr(self, name) < math.inf, name, getattr(self, name), "a positive distance in metres")

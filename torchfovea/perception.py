@@ -31,7 +31,7 @@ from torchfovea.sensing.kinship import kinship
 from torchfovea.sensing.layout import LogPolar, Retina
 from torchfovea.sensing.triangulation import observe
 from torchfovea.sensing.unscented import SigmaPoints
-from torchfovea.setting import require
+from torchfovea.setting import check_types, require
 
 SAME_GAZE_DEG = 2.0  # looks nearer to each other than about this see the same pixels of the same surfaces
 
@@ -97,7 +97,16 @@ class Observer:
         """Raise SettingError for an unknown reward, and for a strategy."""
         given = getattr(acquisition, "__name__", type(acquisition).__name__)
         require(acquisition is None, "Observer(acquisition)", given, "decide(..., strategy=) or search(..., strategy=)")
+        check_types(self)
         require(isinstance(self.head, Head | Kinematics), "head", self.head, "a Head, or Kinematics")
+        for name, camera in zip(("camera", "camera_right"), self.cameras, strict=True):
+            require(isinstance(camera, Camera), name, camera, "a camera: Pinhole, Fisheye, BrownConrady, KannalaBrandt")
+        require(
+            isinstance(self.retina, Retina), "retina", self.retina, "a layout: LogPolar, Uniform or one of your own"
+        )
+        for name, kind in (("points", SigmaPoints), ("classes", Classes)):
+            own = getattr(self, name)
+            require(own is None or isinstance(own, kind), name, own, f"{kind.__name__}, or None")
         check_mode(self.compile)
         known = self.reward in ("inverse_range", "range") or callable(self.reward)
         require(known, "reward", self.reward, "inverse_range, range or a function of points (..., 3)")
@@ -161,6 +170,8 @@ def check_owner(observer: Observer, memory: Memory) -> None:
     Raises:
         SettingError: for a memory of another chart or prior than the observer's; it names both.
     """
+    for name, given, kind in (("observer", observer, Observer), ("memory", memory, Memory)):
+        require(isinstance(given, kind), name, type(given).__name__, f"a torchfovea.{kind.__name__}")
     check_chart(memory, observer.fusion.chart, "fusion.chart")
     require(observer.prior == memory.prior, "prior", observer.prior, f"{memory.prior}, the prior of the memory")
     known = 0 if memory.classes is None else memory.classes.shape[-1]

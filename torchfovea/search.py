@@ -20,9 +20,9 @@ from torchfovea.memory.moving import Motion
 from torchfovea.memory.moving import move as move_memory
 from torchfovea.perception import Observer, Step, check_owner, decide, gaze_at, perceive
 from torchfovea.rows import row, stack
-from torchfovea.sensing.correspondence import Correspondences
+from torchfovea.sensing.correspondence import Correspondences, check_valid
 from torchfovea.sensing.head import Eyes, Gaze, Head, Kinematics, eyes, fixate, gaze_point
-from torchfovea.setting import require
+from torchfovea.setting import require, typed
 
 __all__ = ["Expecting", "Glance", "Look", "Move", "Robot", "StopRule", "search", "seen_from", "steadied"]
 
@@ -136,7 +136,12 @@ def search(
     Raises:
         SettingError: for no saccades, a memory that is not this observer's, and a robot that answers something else.
     """
-    require(saccades >= 1, "saccades", saccades, "at least 1")
+    require(typed(saccades, "int", "saccades") >= 1, "saccades", saccades, "at least 1")
+    moves = callable(getattr(robot, "saccade", None)) and callable(getattr(robot, "look", None))
+    require(moves, "robot", type(robot).__name__, "something with saccade(gaze) and look(gaze, generator)")
+    require(
+        stop is None or (isinstance(stop, tuple) and len(stop) == 2), "stop", stop, "(tolerance, probability), or None"
+    )
     check_owner(observer, memory)
     return _course(robot, observer, memory, saccades, generator, strategy, stop)
 
@@ -157,6 +162,8 @@ def _course(
         move = robot.saccade(gaze)
         require(isinstance(move, Move), "robot.saccade", type(move).__name__, "a torchfovea.search.Move")
         executed = Gaze(*(torch.as_tensor(angle).to(zero) for angle in move.gaze))
+        whole = bool(torch.stack(executed).isfinite().all())
+        require(whole, "robot.saccade's gaze", [angle.tolist() for angle in executed], "finite angles")
         move = move._replace(gaze=executed)
         if step is not None and bool(done.all()):
             yield Glance(move, None, step, ~done, 0.0)
@@ -171,6 +178,7 @@ def _course(
         if look is None:
             looked = torch.zeros_like(done)
         else:
+            check_valid(look.matches)
             matches = look.matches._replace(valid=look.matches.valid & looked[..., None])
             pose = eyes(observer.head, executed) if look.eyes is None else look.eyes
             memory = perceive(observer, memory, matches, pose)

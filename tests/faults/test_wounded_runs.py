@@ -171,7 +171,8 @@ def test_a_changed_digit_is_named_or_made_again(surgery, whole, tmp_path, name, 
         if done["status"] == 0:
             assert content(folder) == expected, where
         else:
-            named = path.name in done["said"] or "made with other settings" in done["said"]
+            # what a manifest says of the others may be what was changed
+            named = path.name in done["said"] or (path.name == "manifest.json" and str(path.parent) in done["said"])
             assert named and "Traceback" not in done["said"], where
         path.write_text(before)
         inject("changed digits")

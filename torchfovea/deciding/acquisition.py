@@ -293,6 +293,8 @@ def draw(kind: Callable[..., Tensor], shape: Sequence[int], like: Tensor, genera
     if isinstance(generator, torch.Generator):
         drawn = kind(*shape, generator=generator, device=generator.device, dtype=torch.float64)
     else:
+        listed = isinstance(generator, Sequence) and all(isinstance(one, torch.Generator) for one in generator)
+        require(listed, "generator", generator, "a torch.Generator, or one for each row")
         rows = math.prod(shape[:-1])
         require(len(generator) == rows, "generators", len(generator), f"one, or one for each of the {rows} rows")
         drawn = torch.stack([kind(shape[-1], generator=g, device=g.device, dtype=torch.float64) for g in generator])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from torchfovea.setting import require
+from torchfovea.setting import check_types, require
 
 __all__ = ["Eligibility"]
 
@@ -28,6 +28,7 @@ class Eligibility:
 
     def __post_init__(self) -> None:
         """Raise SettingError for a negative distance, and numbers that are not finite."""
+        check_types(self, "eligibility.")
         require(0 <= self.nearest_m < math.inf, "eligibility.nearest_m", self.nearest_m, "at least 0 metres")
         require(math.isfinite(self.ground_z_m), "eligibility.ground_z_m", self.ground_z_m, "a finite height in metres")
         sigmas = self.ground_sigmas

@@ -291,9 +291,18 @@ def hedge(view: View, members: Sequence[Strategy], eta: float) -> tuple[Tensor, 
 
 
 def evaluate(strategy: Strategy, view: View) -> tuple[Tensor, Any]:
-    """Scores and state of any strategy; None for the state of those without."""
+    """Scores and state of any strategy; None for the state of those without.
+
+    Raises:
+        SettingError: for what is no function, or does not score every cell.
+    """
+    require(callable(strategy), "strategy", strategy, "a function of a torchfovea.deciding.strategies.View")
     result = strategy(view)
-    return result if isinstance(result, tuple) else (result, None)
+    score, state = result if isinstance(result, tuple) else (result, None)
+    fits = isinstance(score, Tensor) and 0 < score.dim() and score.shape == view.mean.shape[-score.dim() :]
+    shape = tuple(score.shape) if isinstance(score, Tensor) else type(score).__name__
+    require(fits, "strategy's scores", shape, f"{tuple(view.mean.shape)}, one for each cell")
+    return score, state
 
 
 def _source(view: View) -> Generators:

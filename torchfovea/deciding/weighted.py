@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.deciding.acquisition import expected_improvement, upper_confidence_bound
-from torchfovea.setting import require
+from torchfovea.setting import require, typed
 
 __all__ = ["Terms", "Weighting", "joined", "saccades_left", "weighted_alpha", "weighted_score"]
 
@@ -55,11 +55,11 @@ class Weighting:
     def __post_init__(self) -> None:
         """Raise SettingError for numbers that are none, and a negative alpha."""
         for name, value in self.numbers.items():
-            number = isinstance(value, int | float) and not isinstance(value, bool) and not math.isnan(value)
+            value = typed(value, "float", f"acquisition.{name}")
             if name == "alpha":
-                require(number and value >= 0, "acquisition.alpha", value, "a number of at least 0, or inf")
+                require(value >= 0, "acquisition.alpha", value, "a number of at least 0, or inf")
             else:
-                require(number and math.isfinite(value), f"acquisition.{name}", value, "a finite number")
+                require(math.isfinite(value), f"acquisition.{name}", value, "a finite number")
 
     @property
     def numbers(self) -> dict[str, float]:

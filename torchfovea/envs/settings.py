@@ -10,7 +10,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from torchfovea.commands.shared.composed import compose_search
-from torchfovea.setting import require
+from torchfovea.setting import check_types, require
 
 __all__ = ["ACTIONS", "FIDELITIES", "OBSERVATIONS", "EnvSettings", "env_settings", "search_settings"]
 
@@ -59,6 +59,7 @@ class EnvSettings:
 
     def __post_init__(self) -> None:
         """Raise SettingError for a word that is unknown or a number out of range."""
+        check_types(self)
         require(self.fidelity in FIDELITIES, "fidelity", self.fidelity, "one of " + ", ".join(FIDELITIES))
         require(self.saccades >= 2, "saccades", self.saccades, "at least 2, the first look included")
         good = len(self.scenes) > 0 and all(isinstance(seed, int) and seed >= 0 for seed in self.scenes)

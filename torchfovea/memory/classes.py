@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.memory.association import Pairs
-from torchfovea.setting import require
+from torchfovea.setting import check_types, require
 
 __all__ = ["Classes", "Evidence", "class_moments", "join_evidence", "new_classes"]
 
@@ -44,10 +44,11 @@ class Classes:
 
     def __post_init__(self) -> None:
         """Raise SettingError for classes that are none."""
-        require(isinstance(self.count, int) and 2 <= self.count <= 64, "classes", self.count, "2 to 64 classes")
+        check_types(self, "reward.")
+        require(isinstance(self.count, int) and 2 <= self.count <= 64, "reward.count", self.count, "2 to 64 classes")
         inside = isinstance(self.sought, int) and 0 < self.sought < self.count
-        require(inside, "sought", self.sought, f"a class that an object has, 1 to {self.count - 1}")
-        require(1e-3 <= self.prior <= 1e3, "classes.prior", self.prior, "a concentration, 0.001 to 1000")
+        require(inside, "reward.sought", self.sought, f"a class that an object has, 1 to {self.count - 1}")
+        require(1e-3 <= self.prior <= 1e3, "reward.prior", self.prior, "a concentration, 0.001 to 1000")
         form = "a function (views, retina, matches) that returns likelihoods (N, K)"
         require(self.evidence is None or callable(self.evidence), "evidence", type(self.evidence).__name__, form)
 

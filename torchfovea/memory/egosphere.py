@@ -21,7 +21,7 @@ from torch import Tensor
 from torchfovea.gaussian import Gaussian, Information, columns, gaussian_from_information
 from torchfovea.memory.nearest import CellIndex, build_index, neighbour_spacing_rad
 from torchfovea.memory.pooling import nearness
-from torchfovea.setting import require
+from torchfovea.setting import check_types, require
 
 __all__ = [
     "Fusion",
@@ -97,6 +97,7 @@ class Prior:
 
     def __post_init__(self) -> None:
         """Raise SettingError unless all are positive, of a size whose square, and its inverse, float32 can hold."""
+        check_types(self, "prior.")
         for name in ("mean", "std", "bearing_std", "slope_std"):
             value = getattr(self, name)
             require(1e-9 <= value <= 1e9, f"prior.{name}", value, "a positive number, 1e-9 to 1e9")
@@ -131,6 +132,7 @@ class Fusion:
 
     def __post_init__(self) -> None:
         """Raise SettingError for an unknown name or a size out of range."""
+        check_types(self, "fusion.")
         names = ("inverse_range", "aligned", "printed")
         require(self.name in names, "fusion.name", self.name, "one of " + ", ".join(names))
         for name in ("gate_deg", "gate_spacing"):

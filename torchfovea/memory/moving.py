@@ -179,6 +179,7 @@ def move(memory: Memory, step: Motion, fusion: Fusion) -> Memory:
     Raises:
         SettingError: for a batch of memories, or a fusion of another chart.
     """
+    require(isinstance(step, Motion), "step", type(step).__name__, "a torchfovea.Motion, made by motion")
     _without_classes(memory)
     check_chart(memory, fusion.chart, "fusion.chart")
     require(memory.cells.dim() == 2, "cells", tuple(memory.cells.shape), "one memory, a shape (cells, 3)")

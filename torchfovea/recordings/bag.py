@@ -23,7 +23,7 @@ from torchfovea.recordings.ros import (
     stamp_s,
 )
 from torchfovea.sensing.head import Gaze
-from torchfovea.setting import SettingError, require
+from torchfovea.setting import SettingError, check_types, require
 
 __all__ = ["Bag", "Topics"]
 
@@ -58,6 +58,7 @@ class Topics:
 
     def __post_init__(self) -> None:
         """Raise SettingError for times that are not positive, and joints without their topic."""
+        check_types(self, "bag.")
         for name in ("together_s", "told_s"):
             require(
                 0 < getattr(self, name) < math.inf, f"bag.{name}", getattr(self, name), "a positive time in seconds"

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.gaussian import columns
-from torchfovea.setting import require
+from torchfovea.setting import check_types, require
 
 __all__ = ["Camera", "Fisheye", "Pinhole", "image_camera"]
 
@@ -87,6 +87,7 @@ class Pinhole:
 
     def __post_init__(self) -> None:
         """Raise SettingError unless the focal length is positive and all is finite."""
+        check_types(self)
         _require_numbers(self)
 
     @staticmethod
@@ -143,6 +144,7 @@ class Fisheye:
 
     def __post_init__(self) -> None:
         """Raise SettingError unless the focal length is positive and all is finite."""
+        check_types(self)
         _require_numbers(self)
 
     @staticmethod

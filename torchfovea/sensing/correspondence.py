@@ -12,13 +12,14 @@ from torch import Tensor
 
 from torchfovea.sensing.camera import Pinhole
 from torchfovea.sensing.retina import Retina
-from torchfovea.setting import require
+from torchfovea.setting import check_types, require
 
 __all__ = [
     "Budget",
     "Clues",
     "Correspondences",
     "Disparity",
+    "check_valid",
     "doubt",
     "edge_doubt",
     "eye_sigma_px",
@@ -58,6 +59,13 @@ class Correspondences(NamedTuple):
         left_px, right_px, left_sigma, right_sigma, valid = (part[index] for part in self[:5])
         more = (None if part is None else part[index] for part in self[5:])
         return Correspondences(left_px, right_px, left_sigma, right_sigma, valid, *more)
+
+
+def check_valid(matches: Correspondences) -> None:
+    """Raise SettingError for what are no correspondences, or say by numbers which are valid."""
+    kind = type(matches).__name__
+    require(isinstance(matches, Correspondences), "matches", kind, "torchfovea.Correspondences")
+    require(matches.valid.dtype == torch.bool, "matches.valid.dtype", matches.valid.dtype, "torch.bool")
 
 
 class Disparity(NamedTuple):
@@ -185,6 +193,7 @@ class Budget:
 
     def __post_init__(self) -> None:
         """Raise SettingError for impossible numbers."""
+        check_types(self, "budget.")
         require(
             1e-9 <= self.sigma_over_width <= 1e6,
             "budget.sigma_over_width",

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchfovea.rounding import unrounded
 from torchfovea.sensing.kinematics import Eyes, Gaze, Kinematics, axes_meet, rig_frame, to_ego
-from torchfovea.setting import require
+from torchfovea.setting import check_types, require
 
 __all__ = [
     "FARTHEST_M",
@@ -71,6 +71,7 @@ class Head:
 
     def __post_init__(self) -> None:
         """Raise SettingError for a head that cannot exist."""
+        check_types(self, "head.")
         positive = 0 < self.baseline_m < math.inf
         require(positive, "head.baseline_m", self.baseline_m, "a positive distance in metres")
         require(

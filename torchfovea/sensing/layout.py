@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.sensing.lattice import BUDGET_TOLERANCE, disc_lattice, fovea_lattice
-from torchfovea.setting import require
+from torchfovea.setting import check_types, require
 
 __all__ = ["LogPolar", "Retina", "Uniform", "cortical"]
 
@@ -89,6 +89,7 @@ class LogPolar:
 
     def __post_init__(self) -> None:
         """Raise SettingError for a layout that cannot be built."""
+        check_types(self, "sensor.")
         if self.grid is not None:
             most = f"at least 1 ring and 3 sectors, at most {MOST} receptive fields together"
             rings, sectors = self.grid
@@ -192,6 +193,7 @@ class Uniform:
 
     def __post_init__(self) -> None:
         """Raise SettingError for a layout that cannot be built."""
+        check_types(self, "sensor.")
         _require_disc(self.receptive_fields, self.radius_px)
 
     @property

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from torchfovea.gaussian import columns
 from torchfovea.sensing.camera import Fisheye
-from torchfovea.setting import require
+from torchfovea.setting import check_types, require
 
 __all__ = ["BrownConrady", "KannalaBrandt"]
 
@@ -57,6 +57,7 @@ class BrownConrady:
 
     def __post_init__(self) -> None:
         """Raise SettingError for focal lengths that are not positive, and what is no set of coefficients."""
+        check_types(self)
         _require_numbers(self)
         fits = len(self.distortion) in (0, 4, 5, 8)
         require(fits, "distortion", self.distortion, "k1, k2, p1, p2[, k3[, k4, k5, k6]], or none")
@@ -187,6 +188,7 @@ class KannalaBrandt:
 
     def __post_init__(self) -> None:
         """Raise SettingError for focal lengths that are not positive, and what is no set of coefficients."""
+        check_types(self)
         _require_numbers(self)
         require(len(self.distortion) == 4, "distortion", self.distortion, "k1, k2, k3, k4")
 

@@ -14,7 +14,7 @@ from torchfovea.gaussian import columns, definiteness
 from torchfovea.rounding import unrounded
 from torchfovea.sensing.camera import Camera, Pinhole
 from torchfovea.sensing.chart import Components, bilinear_moments, in_tangent_frame
-from torchfovea.sensing.correspondence import Correspondences
+from torchfovea.sensing.correspondence import Correspondences, check_valid
 from torchfovea.sensing.head import Eyes, rig_frame
 from torchfovea.sensing.head import to_ego as turn
 from torchfovea.sensing.pinhole import fast_observations, weights_of
@@ -180,6 +180,7 @@ def observe(
     Differentiable in the correspondences, their sigmas and the poses.
     """
     require(chart in ("inverse_range", "cartesian"), "chart", chart, "inverse_range or cartesian")
+    check_valid(matches)
     points = points or (SigmaPoints.midpoint() if chart == "cartesian" else SigmaPoints())
     batch, count = matches.valid.shape[:-1], matches.valid.shape[-1]
     eyes = Eyes(*(part.expand(*batch, *part.shape[-k:]) for part, k in zip(eyes, (2, 1, 2, 1), strict=True)))

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.gaussian import columns
-from torchfovea.setting import require
+from torchfovea.setting import check_types, require
 
 __all__ = [
     "SigmaPoints",
@@ -56,6 +56,7 @@ class SigmaPoints:
 
     def __post_init__(self) -> None:
         """Raise SettingError for parameters without real sigma points."""
+        check_types(self, "sigma_points.")
         require(self.dimensions >= 1, "sigma_points.dimensions", self.dimensions, "at least 1")
         require(self.alpha > 0, "sigma_points.alpha", self.alpha, "a positive spread")
         require(

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.sensing.head import Gaze, Head, cyclopean, eyes, fixate
-from torchfovea.setting import SettingError, require
+from torchfovea.setting import SettingError, check_types, require
 from torchfovea.sim.compile import compile_solids, seeded, stand_at
 from torchfovea.sim.model import EgoPose, Scene
 from torchfovea.sim.rays import cast
@@ -73,6 +73,7 @@ class Cans:
 
     def __post_init__(self) -> None:
         """Raise SettingError for values out of range; lists become tuples."""
+        check_types(self, "scene.")
         require(
             isinstance(self.cans, int) and 2 <= self.cans <= 40, "scene.cans", self.cans, "a whole number from 2 to 40"
         )
@@ -82,10 +83,9 @@ class Cans:
             "can_radius_m": (0.01, 0.3), "can_height_m": (0.02, 1.0),
         }  # fmt: skip
         for name, (low, high) in limits.items():
-            value = tuple(float(v) for v in getattr(self, name))
-            fine = len(value) == 2 and low <= value[0] <= value[1] <= high
+            value = getattr(self, name)
+            fine = low <= value[0] <= value[1] <= high
             require(fine, f"scene.{name}", value, f"(low, high) within {low} to {high}")
-            object.__setattr__(self, name, value)
         thin = 0.002 <= self.pole_radius_m < self.can_radius_m[0]
         require(thin, "scene.pole_radius_m", self.pole_radius_m, "at least 0.002 and thinner than the thinnest can")
         require(0 <= self.margin_m <= 1, "scene.margin_m", self.margin_m, "0 to 1 metre")

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from torchfovea.sensing.head import Head, eyes, fixate
-from torchfovea.setting import SettingError, require
+from torchfovea.setting import SettingError, check_types, require
 from torchfovea.sim.cans import Cans, place_cans, point_in_sight
 from torchfovea.sim.compile import compile_solids, seeded, stand_at
 from torchfovea.sim.model import EgoPose, Scene
@@ -37,10 +37,9 @@ class Hidden:
 
     def __post_init__(self) -> None:
         """Raise SettingError for a screen or a place that is none; a list becomes a tuple."""
-        place = tuple(float(v) for v in self.seen_from)
-        good = len(place) == 3 and all(math.isfinite(v) for v in place)
+        check_types(self, "scene.")
+        good = all(map(math.isfinite, self.seen_from))
         require(good, "scene.seen_from", self.seen_from, "three finite numbers, [x m, y m, yaw deg]")
-        object.__setattr__(self, "seen_from", place)
         require(0.2 <= self.screen_at <= 0.9, "scene.screen_at", self.screen_at, "0.2 to 0.9 of the way")
         require(0.05 <= self.screen_half_m <= 1, "scene.screen_half_m", self.screen_half_m, "0.05 to 1 metre")
 

@@ -13,7 +13,7 @@ import torch
 
 from torchfovea.memory.classes import Classes
 from torchfovea.sensing.head import Head
-from torchfovea.setting import SettingError, require
+from torchfovea.setting import SettingError, check_types, require
 from torchfovea.sim.cans import Cans, place_cans, point_in_sight
 from torchfovea.sim.compile import compile_solids, seeded, stand_at
 from torchfovea.sim.model import EgoPose, Marks, Scene
@@ -42,6 +42,7 @@ class Marked:
 
     def __post_init__(self) -> None:
         """Raise SettingError for marks that tell nothing apart."""
+        check_types(self, "scene.")
         require(isinstance(self.marks, int) and 2 <= self.marks <= 63, "scene.marks", self.marks, "2 to 63 marks")
         borne = isinstance(self.sought, int) and 1 <= self.sought <= self.marks
         require(borne, "scene.sought", self.sought, f"a class that an object has, 1 to {self.marks}")

@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import torch
 
 from torchfovea.sensing.head import Gaze, Head, cyclopean
-from torchfovea.setting import require
+from torchfovea.setting import check_types, require
 
 __all__ = ["InstantMotor", "Motor", "Moved", "turned_deg"]
 
@@ -71,6 +71,7 @@ class InstantMotor:
 
     def __post_init__(self) -> None:
         """Raise SettingError for durations that are not positive."""
+        check_types(self, "motor.")
         for name in ("eye_base_s", "eye_slope_s_per_deg"):
             require(getattr(self, name) >= 0, f"motor.{name}", getattr(self, name), "zero or more")
         for name in ("neck_speed_deg_s", "neck_acceleration_deg_s2"):

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchfovea.setting import require
+from torchfovea.setting import check_types, require
 
 __all__ = ["ImageNoise", "expose"]
 
@@ -34,6 +34,7 @@ class ImageNoise:
 
     def __post_init__(self) -> None:
         """Raise SettingError for numbers out of range."""
+        check_types(self, "noise.")
         require(self.photons >= 1, "noise.photons", self.photons, "at least 1; .inf: no photon noise")
         require(0 <= self.read <= 1, "noise.read", self.read, "a share of white, 0 to 1")
         require(0 <= self.exposure <= 2, "noise.exposure", self.exposure, "0 to 2")

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.sensing.head import Head
-from torchfovea.setting import require
+from torchfovea.setting import check_types, require
 from torchfovea.sim.backend import load_mujoco
 from torchfovea.sim.head_model import add_head
 from torchfovea.sim.texture import Paint
@@ -101,6 +101,7 @@ class Room:
 
     def __post_init__(self) -> None:
         """Raise SettingError for a room without room."""
+        check_types(self, "room.")
         for name in ("front_m", "back_m", "side_m", "height_m"):
             value = getattr(self, name)
             least = _FURNISHED[name] if self.furniture else 1.0

@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from torchfovea.sensing.head import Head
-from torchfovea.setting import require
+from torchfovea.setting import check_types, require
 from torchfovea.sim.cans import Cans
 from torchfovea.sim.compile import scene_of, seeded, stand_at
 from torchfovea.sim.hidden import Hidden
@@ -50,6 +50,7 @@ class AttentionWorld:
 
     def __post_init__(self) -> None:
         """Raise SettingError for cans that overlap or reach the head."""
+        check_types(self, "scene.")
         require(0.01 <= self.can_radius_m <= 0.14, "scene.can_radius_m", self.can_radius_m, "0.01 to 0.14 m")
         require(0.02 <= self.can_height_m <= 0.5, "scene.can_height_m", self.can_height_m, "0.02 to 0.5 m")
         require(self.room.front_m >= 2.5, "room.front_m", self.room.front_m, "at least 2.5 m behind the farthest can")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 from torchfovea.memory.moving import Motion, motion
-from torchfovea.setting import require
+from torchfovea.setting import check_types, require
 from torchfovea.sim.model import EgoPose
 
 __all__ = ["Odometry", "Route"]
@@ -30,6 +30,7 @@ class Odometry:
 
     def __post_init__(self) -> None:
         """Raise SettingError for standard deviations that are none."""
+        check_types(self, "motion.")
         require(0 <= self.shift_m < math.inf, "motion.shift_m", self.shift_m, "at least 0 metres")
         require(0 <= self.turn_deg < math.inf, "motion.turn_deg", self.turn_deg, "at least 0 degrees")
 
@@ -63,14 +64,17 @@ class Route:
 
     waypoints: Sequence[Sequence[float]] = ((0.0, 0.0, 0.0), (0.0, 0.4, 0.0), (0.0, -0.4, 0.0))
     step_m: float = 0.1
-    odometry: Odometry = Odometry()
+    odometry: Odometry = field(default_factory=Odometry)
 
     def __post_init__(self) -> None:
         """Raise SettingError for a path that is none."""
+        check_types(self, "motion.")
         require(0 < self.step_m < math.inf, "motion.step_m", self.step_m, "a positive distance in metres")
-        require(len(self.waypoints) >= 1, "motion.waypoints", self.waypoints, "at least one [x m, y m, yaw deg]")
+        some = isinstance(self.waypoints, Sequence) and not isinstance(self.waypoints, str) and len(self.waypoints) >= 1
+        require(some, "motion.waypoints", self.waypoints, "at least one [x m, y m, yaw deg]")
         for k, point in enumerate(self.waypoints):
-            good = len(point) == 3 and all(isinstance(v, int | float) and math.isfinite(v) for v in point)
+            good = isinstance(point, Sequence) and len(point) == 3
+            good = good and all(isinstance(v, int | float) and math.isfinite(v) for v in point)
             require(good, f"motion.waypoints[{k}]", point, "three finite numbers, [x m, y m, yaw deg]")
 
     def pose(self, step: int) -> EgoPose:

@@ -23,14 +23,14 @@ from torch import Tensor
 from torchfovea.imported import load_function
 from torchfovea.sensing.correspondence import Budget, Correspondences, Disparity
 from torchfovea.sensing.layout import Retina
-from torchfovea.setting import require
+from torchfovea.setting import SettingError, check_types, require
 from torchfovea.stereo.disparity_files import check_maps, load_disparity
 from torchfovea.stereo.maps import checked_range, read_map
 from torchfovea.stereo.rectification import frame_to_show, image_frame
 from torchfovea.stereo.views import Views, grey_of
 from torchfovea.stereo.visibility import undisputed
 
-__all__ = ["DisparityFunction", "External", "load_matcher", "match_external"]
+__all__ = ["DisparityFunction", "External", "load_matcher", "match_external", "resolve_source"]
 
 DisparityFunction = Callable[[np.ndarray, np.ndarray], Any]
 """From the left and right images, float32 (H, W, 3) in [0, 1], to disparity (H, W) [px] or (disparity, confidence)."""
@@ -76,6 +76,7 @@ class External:
 
     def __post_init__(self) -> None:
         """Raise SettingError for impossible numbers."""
+        check_types(self, "matcher.")
         scaled = self.scale != 0 and math.isfinite(self.scale)
         require(scaled, "matcher.scale", self.scale, "a number other than 0, negative to turn the sign round")
         require(self.tells in TELLS, "matcher.tells", self.tells, "one of " + ", ".join(TELLS))
@@ -207,20 +208,36 @@ def _check_sign(disparity: Tensor, doffs_px: float, width: int, scale: float) ->
     require(beyond <= 0.5, "disparities", span, form.format("sixteenths become pixels", scale / 16))
 
 
+def resolve_source(source: object, files: bool) -> Path | DisparityFunction:
+    """What a source stands for: a disparity file, where it may be one, or a function.
+
+    Args:
+        source: a function, its name ``package.module:function``, or a file's.
+        files: whether a file has an answer: to a rectified pair.
+
+    Raises:
+        SettingError: for anything else, nothing included.
+    """
+    expected = "package.module:function, a function or, for a rectified pair, a disparity file"
+    if isinstance(source, Path) or (isinstance(source, str) and (":" not in source or Path(source).exists())):
+        require(files, "matcher.source", source, expected)
+        return Path(source)
+    if isinstance(source, str):
+        return load_matcher(source)
+    if not callable(source):
+        raise SettingError(f"matcher.source = {source}: expected {expected}")
+    return source
+
+
 def _answer(
     source: str | Path | DisparityFunction, shown: Tensor, files: bool, span: tuple[float, float]
 ) -> tuple[Tensor, Tensor | None]:
     """The disparity and its worth (H, W) of views (2, 3, H, W), from a file where it may be one, or a function."""
-    if isinstance(source, str | Path) and (isinstance(source, Path) or ":" not in source or Path(source).exists()):
-        require(
-            files, "matcher.source", source, "package.module:function; a file has the disparity of a rectified pair"
-        )
-        maps = load_disparity(source, span=span)
-        return check_maps(*maps, (shown.shape[-2], shown.shape[-1]), f"matcher.source = {source}", span)
-    matcher = load_matcher(source) if isinstance(source, str) else source
-    assert not isinstance(matcher, Path)
-    require(callable(matcher), "matcher.source", matcher, "a file or a function")
-    return _ask(matcher, shown, span)
+    found = resolve_source(source, files)
+    if not isinstance(found, Path):
+        return _ask(found, shown, span)
+    maps = load_disparity(found, span=span)
+    return check_maps(*maps, (shown.shape[-2], shown.shape[-1]), f"matcher.source = {source}", span)
 
 
 def _doubt(

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from torchfovea.sensing.correspondence import Budget, Correspondences, Disparity
 from torchfovea.sensing.layout import Retina
-from torchfovea.setting import SettingError, require
-from torchfovea.stereo.external import DisparityFunction, External, match_external
+from torchfovea.setting import require
+from torchfovea.stereo.external import DisparityFunction, External, match_external, resolve_source
 from torchfovea.stereo.matching import match_sgbm
 from torchfovea.stereo.sgbm import SGBM
 from torchfovea.stereo.sweep import Sweep, SweepRange, Volume, match_sweep
@@ -91,10 +91,8 @@ class Matcher(NamedTuple):
             return match_sgbm(views, retina, params, budget, self.nearest_m)
         if isinstance(params, Sweep):
             return match_sweep(views, retina, params, budget, self.nearest_m, volume=self.volume)
-        expected = "package.module:function, or a disparity file for a rectified pair"
-        if self.source is None:
-            raise SettingError(f"matcher.source = None: expected {expected}")
-        return match_external(self.source, views, retina, params, budget, self.nearest_m)
+        source = resolve_source(self.source, views.rectified)
+        return match_external(source, views, retina, params, budget, self.nearest_m)
 
 
 def checked_matches(answer: object, retina: Retina) -> tuple[Correspondences, Any]:

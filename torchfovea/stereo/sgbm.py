@@ -14,7 +14,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from torchfovea.setting import SettingError, require
+from torchfovea.setting import SettingError, check_types, require
 
 __all__ = ["SGBM", "check_room", "disparity_sgbm"]
 
@@ -65,6 +65,7 @@ class SGBM:
 
     def __post_init__(self) -> None:
         """Raise SettingError for what the matcher cannot run with."""
+        check_types(self, "matcher.")
         odd = self.block_px >= 1 and self.block_px % 2 == 1
         require(odd, "matcher.block_px", self.block_px, "an odd number of pixels")
         small, large = self.penalties

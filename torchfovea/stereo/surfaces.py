@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchfovea.setting import require
+from torchfovea.setting import check_types, require
 from torchfovea.stereo.costs import Eye, correlate, inverse_depths, own_values, project, sheet_rays
 from torchfovea.stereo.semiglobal import aggregate
 from torchfovea.stereo.sheets import Sheet, nearest_rf, read_sheet
@@ -63,6 +63,7 @@ class Sweep:
 
     def __post_init__(self) -> None:
         """Raise SettingError for what the sweep cannot run with."""
+        check_types(self, "matcher.")
         for name in ("window", "refine_window"):
             # a sheet keeps four cells of context
             value = getattr(self, name)

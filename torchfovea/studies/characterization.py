@@ -24,7 +24,7 @@ from torchfovea.sensing.head import Eyes, Gaze, Head, eyes, to_ego
 from torchfovea.sensing.layout import Retina
 from torchfovea.sensing.triangulation import observe
 from torchfovea.sensing.unscented import SigmaPoints
-from torchfovea.setting import require
+from torchfovea.setting import check_types, require
 
 __all__ = [
     "Characterization", "Places", "PlaneSensor", "Snapshot", "characterize_planes", "correspond_plane",
@@ -59,6 +59,7 @@ class PlaneSensor:
 
     def __post_init__(self) -> None:
         """Raise SettingError for eyes that coincide."""
+        check_types(self)
         require(0 < self.baseline_m < math.inf, "baseline_m", self.baseline_m, "a positive distance in metres")
 
 

@@ -19,7 +19,7 @@ from scipy.stats import spearmanr
 from torch import Tensor
 
 from torchfovea.sensing.correspondence import Budget
-from torchfovea.setting import require
+from torchfovea.setting import check_types, require
 from torchfovea.studies.calibration import Judged, mixture_nll, select
 
 __all__ = ["BudgetFit", "Likelihood", "claim_rank", "fit_budget", "least_match_px"]
@@ -51,6 +51,7 @@ class Likelihood:
 
     def __post_init__(self) -> None:
         """Raise SettingError for impossible numbers."""
+        check_types(self, "fit.")
         require(0 < self.outlier_share < 0.5, "fit.outlier_share", self.outlier_share, "between 0 and 0.5")
 
 

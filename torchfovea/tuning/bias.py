@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchfovea.deciding.weighted import Weighting
 from torchfovea.memory.sphere import DirectionMixture, Quadrature, deep_tail, fix_gauge, log_radial_moment
-from torchfovea.setting import require
+from torchfovea.setting import check_types, require
 
 __all__ = [
     "Bias", "Shape", "decode", "encode", "features", "fix_vector", "fov_of", "log_density_each",
@@ -54,6 +54,7 @@ class Shape:
 
     def __post_init__(self) -> None:
         """Raise SettingError for values out of range."""
+        check_types(self)
         good = isinstance(self.components, int) and 1 <= self.components <= 64
         require(good, "components", self.components, "a whole number from 1 to 64")
         fine = self.fov_deg is None or _FOV_DEG[0] <= self.fov_deg <= _FOV_DEG[1]

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchfovea.gaussian import columns
 from torchfovea.sensing.head import Head, can_fixate
-from torchfovea.setting import require, require_name
+from torchfovea.setting import check_types, require, require_name
 
 __all__ = ["Distribution", "Hits", "Scenes", "draw_scenes", "first_surfaces", "nearest_point", "stream"]
 
@@ -76,13 +76,12 @@ class Distribution:
 
     def __post_init__(self) -> None:
         """Raise SettingError for values out of range; lists become tuples."""
+        check_types(self, "distribution.")
         require_name(self.name, "distribution.name")
-        whole = isinstance(self.cans, int) and 2 <= self.cans <= 40
-        require(whole, "distribution.cans", self.cans, "a whole number from 2 to 40")
-        regions = tuple(tuple(float(v) for v in region) for region in self.regions)
-        object.__setattr__(self, "regions", regions)
+        require(2 <= self.cans <= 40, "distribution.cans", self.cans, "a whole number from 2 to 40")
+        regions = self.regions
         for region in regions:
-            fine = len(region) == 4 and -180 <= region[0] <= region[1] <= 180 and -85 <= region[2] <= region[3] <= 85
+            fine = -180 <= region[0] <= region[1] <= 180 and -85 <= region[2] <= region[3] <= 85
             require(fine, "distribution.regions", region, "[azimuth low, high, elevation low, high] in degrees")
         require(len(regions) > 0, "distribution.regions", regions, "at least one region")
         require(
@@ -96,11 +95,10 @@ class Distribution:
             85), "range_m": (0.3, 20), "can_radius_m": (0.01, 0.3), "can_height_m": (0.02, 1.0),
         }  # fmt: skip
         for name, (low, high) in limits.items():
-            pair = tuple(float(v) for v in getattr(self, name))
-            ordered = len(pair) == 2 and low <= pair[0] <= high and low <= pair[1] <= high
+            pair = getattr(self, name)
+            ordered = low <= pair[0] <= high and low <= pair[1] <= high
             ordered = ordered and (name == "task_spread_deg" or pair[0] <= pair[1])
             require(ordered, f"distribution.{name}", pair, f"(low, high) within {low} to {high}")
-            object.__setattr__(self, name, pair)
         require(1 <= self.told_spread <= 10, "distribution.told_spread", self.told_spread, "a factor from 1 to 10")
         require(0 <= self.margin_m <= 5, "distribution.margin_m", self.margin_m, "0 to 5 metres")
         for name in ("front_m", "back_m", "side_m", "height_m"):

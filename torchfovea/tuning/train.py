@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.files import write_tensors
-from torchfovea.setting import SettingError, require
+from torchfovea.setting import SettingError, check_types, require
 from torchfovea.tuning.bias import fix_vector
 from torchfovea.tuning.estimators import Gradient, counterfactual, coverage, covered, fov_difference, policy
 from torchfovea.tuning.myopic import myopic
@@ -76,6 +76,7 @@ class Schedule:
 
     def __post_init__(self) -> None:
         """Raise SettingError for values out of range."""
+        check_types(self)
         for name in ("estimator", "warm_estimator"):
             require(getattr(self, name) in ESTIMATORS, name, getattr(self, name), "one of " + ", ".join(ESTIMATORS))
         for name in ("episodes", "scenes", "validations", "validation_scenes"):

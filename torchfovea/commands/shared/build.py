@@ -12,7 +12,7 @@ from torch import Tensor
 from torchfovea.commands.shared.budgets import build_budget
 from torchfovea.commands.shared.named import build_named, name_of, targets_of
 from torchfovea.commands.shared.rewards import build_classes, build_reward
-from torchfovea.commands.shared.settings import choice, construct, number, typed, whole
+from torchfovea.commands.shared.settings import choice, construct, number, whole
 from torchfovea.imported import load_function
 from torchfovea.memory import sphere
 from torchfovea.memory.egosphere import Fusion, Prior
@@ -22,7 +22,7 @@ from torchfovea.sensing.head import Head, Kinematics, fixate
 from torchfovea.sensing.layout import Retina
 from torchfovea.sensing.own_layout import check_retina
 from torchfovea.sensing.unscented import SigmaPoints
-from torchfovea.setting import SettingError, require
+from torchfovea.setting import SettingError, require, typed
 from torchfovea.sim.arena import SimulatedArena
 from torchfovea.sim.marked import check_marks
 from torchfovea.sim.motor import Motor
@@ -31,7 +31,7 @@ from torchfovea.sim.rays import Renderer
 from torchfovea.sim.scene import Room, Scene, build_scene
 from torchfovea.sim.walk import Route
 from torchfovea.sim.world import World
-from torchfovea.stereo.external import External
+from torchfovea.stereo.external import External, resolve_source
 from torchfovea.stereo.matchers import Match, Matcher
 from torchfovea.stereo.sgbm import SGBM
 from torchfovea.stereo.sweep import Sweep
@@ -256,6 +256,8 @@ def build_match(cfg: DictConfig, observer: Observer | None = None) -> Match:
         if isinstance(source, DictConfig):
             source = build_named(cfg, "matcher.source", "a function (left, right) that returns a disparity", ())
             require(callable(source), "matcher.source", type(source).__name__, "a function (left, right)")
+        if isinstance(made, External):  # whoever has a memory has two eyes, and no rectified pair
+            resolve_source(source, files=observer is None)
         matcher = Matcher(made, number(cfg, "matcher.nearest_range_m"), source)
         knows = observer is not None and observer.fusion.votes
         expected = "all, or search with fusion=inverse_range, whose memory tells where to look"

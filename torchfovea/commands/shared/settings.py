@@ -8,9 +8,9 @@ from typing import Any, TypeVar
 
 from omegaconf import DictConfig, OmegaConf
 
-from torchfovea.setting import require
+from torchfovea.setting import require, typed
 
-__all__ = ["choice", "construct", "is_number", "is_whole", "number", "typed", "whole", "within"]
+__all__ = ["choice", "construct", "is_number", "is_whole", "number", "whole", "within"]
 
 T = TypeVar("T")
 
@@ -34,39 +34,6 @@ def construct(kind: type[T], node: DictConfig | dict[str, Any], where: str) -> T
         if field.name in node:
             values[field.name] = typed(node[field.name], str(field.type), f"{where}.{field.name}")
     return kind(**values)
-
-
-def typed(value: Any, kind: str, setting: str) -> Any:
-    """A value of a dataclass field's type, told by its name; `Range` is a pair of numbers, `Grid` of whole ones.
-
-    Raises:
-        SettingError: for a value of another type.
-    """
-    if kind.endswith("| None"):
-        return None if value is None else typed(value, kind.removesuffix("| None").strip(), setting)
-    if kind == "Range":
-        pair = not isinstance(value, str) and hasattr(value, "__len__") and len(value) == 2
-        require(pair, setting, value, "two numbers, [least, most]")
-        return tuple(typed(v, "float", setting) for v in value)
-    if kind == "Grid":
-        pair = not isinstance(value, str) and hasattr(value, "__len__") and len(value) == 2
-        require(pair, setting, value, "two whole numbers")
-        return tuple(typed(v, "int", setting) for v in value)
-    number = isinstance(value, int | float) and not isinstance(value, bool) and value == value
-    if kind == "float":
-        require(number, setting, value, "a number")
-        return float(value)
-    if kind == "int":
-        whole = number and abs(value) < math.inf and float(value).is_integer()
-        require(whole, setting, value, "a whole number")
-        return int(value)
-    require(
-        kind not in ("bool", "str") or type(value).__name__ == kind,
-        setting,
-        value,
-        {"bool": "true or false"}.get(kind, "text"),
-    )
-    return value
 
 
 def choice(cfg: DictConfig, setting: str, options: tuple[str, ...]) -> str:
