@@ -45,12 +45,12 @@ class Classes:
     def __post_init__(self) -> None:
         """Raise SettingError for classes that are none."""
         check_types(self, "reward.")
-        require(isinstance(self.count, int) and 2 <= self.count <= 64, "reward.count", self.count, "2 to 64 classes")
-        inside = isinstance(self.sought, int) and 0 < self.sought < self.count
+        require(2 <= self.count <= 64, "reward.count", self.count, "2 to 64 classes")
+        inside = 0 < self.sought < self.count
         require(inside, "reward.sought", self.sought, f"a class that an object has, 1 to {self.count - 1}")
         require(1e-3 <= self.prior <= 1e3, "reward.prior", self.prior, "a concentration, 0.001 to 1000")
         form = "a function (views, retina, matches) that returns likelihoods (N, K)"
-        require(self.evidence is None or callable(self.evidence), "evidence", type(self.evidence).__name__, form)
+        require(self.evidence is None or callable(self.evidence), "reward.evidence", type(self.evidence).__name__, form)
 
 
 def new_classes(classes: Classes, cells: Tensor) -> Tensor:

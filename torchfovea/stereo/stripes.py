@@ -18,7 +18,7 @@ from torchfovea.sensing.correspondence import Correspondences
 from torchfovea.sensing.marks import field_width_rad, readable
 from torchfovea.sensing.retina import Retina, interpolate
 from torchfovea.sensing.triangulation import triangulate
-from torchfovea.setting import require
+from torchfovea.setting import check_types, require
 from torchfovea.stereo.views import Views
 
 __all__ = ["Stripes", "StripesShown", "direction_votes"]
@@ -70,7 +70,8 @@ class Stripes:
 
     def __post_init__(self) -> None:
         """Raise SettingError for impossible numbers."""
-        require(isinstance(self.marks, int) and 2 <= self.marks <= 63, "evidence.marks", self.marks, "2 to 63 marks")
+        check_types(self, "evidence.")
+        require(2 <= self.marks <= 63, "evidence.marks", self.marks, "2 to 63 marks")
         require(1e-5 <= self.detail_m <= 1, "evidence.detail_m", self.detail_m, "0.00001 to 1 metre")
         for name in ("concentration", "redness"):
             require(0 <= getattr(self, name) <= 1000, f"evidence.{name}", getattr(self, name), "0 to 1000")
