@@ -1,6 +1,6 @@
 """Whether the tests notice small faults in the mathematical core: plants each, runs what would see it, keeps count.
 
-    python scripts/mutants.py --out FOLDER [--seconds 300] [--only deciding.reward] [--again]
+    python scripts/mutants.py --out FOLDER [--seconds 300] [--only deciding.reward] [--start 8] [--again]
 
 Nothing is written into the tree: one process imports the package and collects the tests once; for every fault it forks,
 and the child alone changes the functions in its memory and runs the tests that reach the changed line, the fastest
@@ -285,7 +285,7 @@ def pending(given: argparse.Namespace, out: Path) -> Iterator[Mutant]:
     """
     known, reasons = results(out), explained()
     every = [m for module in given.only or CORE for m in mutants_of(module, source_of(module)[1])]
-    for mutant in sorted(every, key=lambda m: m.key):
+    for mutant in sorted((m for m in every if m.key >= given.start), key=lambda m: m.key):
         state = known.get(mutant.key, {}).get("state")
         if state is None or (given.again and state == "survived" and mutant.key not in reasons):
             yield mutant
@@ -342,6 +342,7 @@ if __name__ == "__main__":
     parser.add_argument("--out", required=True, help="folder outside the tree")
     parser.add_argument("--seconds", type=float, default=1e9, help="of CPU, after which no further fault is begun")
     parser.add_argument("--only", nargs="*", help="modules of the core")
+    parser.add_argument("--start", default="", help="begin at faults of this key or a later one, a fresh sample of them")
     parser.add_argument("--tests", nargs="*", default=TESTS, help="names of test files")
     parser.add_argument("--again", action="store_true", help="try survivors that are not explained again")
     parser.add_argument("--verbose", action="store_true", help="a line for every fault")
