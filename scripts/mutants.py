@@ -342,7 +342,9 @@ if __name__ == "__main__":
     parser.add_argument("--out", required=True, help="folder outside the tree")
     parser.add_argument("--seconds", type=float, default=1e9, help="of CPU, after which no further fault is begun")
     parser.add_argument("--only", nargs="*", help="modules of the core")
-    parser.add_argument("--start", default="", help="begin at faults of this key or a later one, a fresh sample of them")
+    parser.add_argument(
+        "--start", default="", help="begin at faults of this key or a later one, a fresh sample of them"
+    )
     parser.add_argument("--tests", nargs="*", default=TESTS, help="names of test files")
     parser.add_argument("--again", action="store_true", help="try survivors that are not explained again")
     parser.add_argument("--verbose", action="store_true", help="a line for every fault")

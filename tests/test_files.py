@@ -162,3 +162,20 @@ def test_what_a_killed_writer_left_is_cleared_away_and_what_one_writes_is_not(tm
         for process in started:
             process.kill()
             process.communicate()
+
+
+def test_names_with_dollars_are_written_as_they_stand(tmp_path):
+    """Matplotlib would take them for formulas, and fail at those that are none; ticks of powers of ten are formulas."""
+    from matplotlib.figure import Figure
+    from matplotlib.text import Text
+
+    figure = Figure(figsize=(3, 2))
+    axes = figure.subplots()
+    axes.set(title="$a^$", xlabel="$b$ and $c_$ [m]", ylabel="d [m]", yscale="log")
+    axes.plot([1, 2, 3], [1, 100, 1000], label=r"$\frac$")
+    axes.set_xticks([1, 2], ["$x^$", "y"])
+    axes.legend()
+    write_figure(tmp_path / "f.png", figure, dpi=50)
+    texts = {text.get_text(): text.get_parse_math() for text in figure.findobj(Text)}
+    assert not any(parsed for text, parsed in texts.items() if "$" in text and "mathdefault" not in text)
+    assert texts[r"$\mathdefault{10^{2}}$"]

@@ -197,7 +197,13 @@ def write_csv(path: str | os.PathLike[str], columns: Sequence[str], rows: Iterab
 
 
 def write_figure(path: str | os.PathLike[str], figure: Any, **options: Any) -> None:
-    """Write a matplotlib figure in the format of the path's suffix; ``options`` go to its ``savefig``."""
+    """Write a matplotlib figure in the format of the path's suffix; ``options`` go to its ``savefig``.
+
+    What users name is written as it stands: only a tick's number is a formula, whatever else has dollars in it.
+    """
+    for text in figure.findobj(lambda artist: hasattr(artist, "set_parse_math")):
+        if "$" in text.get_text() and "mathdefault" not in text.get_text():
+            text.set_parse_math(False)
     with replacing(path) as temporary:
         figure.savefig(temporary, **options)
 
