@@ -16,6 +16,7 @@ from torchfovea.memory.association import associate
 from torchfovea.memory.nearest import build_index, neighbour_spacing_rad
 from torchfovea.memory.sphere import fibonacci_directions, latitude_longitude_directions
 from torchfovea.sensing.correspondence import Budget
+from torchfovea.sensing.retina import fovea, reconstruct
 from torchfovea.sensing.triangulation import Observations, observe
 from torchfovea.sensing.unscented import SigmaPoints
 from torchfovea.setting import SettingError
@@ -149,6 +150,8 @@ def test_loops_of_each_type_only_where_nothing_else_is_asked():
         assert loops(x.requires_grad_()) is None
         with torch.no_grad():
             assert loops(x) is not None
+            with torch.autograd.forward_ad.dual_level():
+                assert loops(x) is None
         assert torch.func.vmap(lambda t: t * float(loops(t) is None))(torch.ones(2)).tolist() == [1, 1]
 
 
@@ -215,3 +218,16 @@ def test_a_loop_appraises_as_the_definition(batch, reward, dtype):
     same(*(step._replace(memory=(), state=()) for step in decided), dtype)
     floor = dataclasses.replace(observer, eligibility=Eligibility(nearest_m=1e6))
     same(*(decide(one, memory)._replace(memory=(), state=()) for one in (floor, compiled(floor, "on"))), dtype)
+
+
+@pytest.mark.parametrize("dtype", CLOSE)
+@pytest.mark.parametrize("size", [(1, 1), (2, 1), (7, 64), (33, 50), (40, 40)])
+@pytest.mark.parametrize("gazes", [None, (2, 2), (2, 3, 2)])
+def test_loops_look_as_the_definition(gazes, size, dtype):
+    """At images of any size, strided too, in the middle, at one place or several, also beyond their borders."""
+    generator = torch.Generator().manual_seed(0)
+    image = torch.rand(2, *size, 3, generator=generator, dtype=torch.float64).to(dtype).movedim(-1, 1)
+    gaze = None if gazes is None else 80 * torch.rand(gazes, generator=generator, dtype=torch.float64).to(dtype) - 20
+    same(*both(lambda: fovea(image, gaze, LogPolar(900), scale=max(size) / 200)), dtype)
+    values = torch.rand(2, 3, LogPolar(900).count, generator=generator, dtype=torch.float64).to(dtype)
+    same(*both(lambda: reconstruct(values, LogPolar(900), size)), dtype)

@@ -78,7 +78,7 @@ def loops(*tensors: Tensor | None) -> Loops | None:
         return None
     if kind not in _REALS or any(t.device.type != "cpu" or t.dtype != kind for t in given):
         return None
-    if torch.is_grad_enabled() and wants_gradient(given):
+    if (torch.is_grad_enabled() and wants_gradient(given)) or torch.autograd.forward_ad._current_level >= 0:
         return None
     built = _built(_REALS[kind])
     if isinstance(built, str):

@@ -23,7 +23,7 @@ from torch import Tensor
 from torchfovea.finite import require_finite
 from torchfovea.gaussian import columns
 from torchfovea.sensing.layout import LogPolar, Retina, Uniform, cortical
-from torchfovea.sensing.sampling import constant, place, read, sampling, wide
+from torchfovea.sensing.sampling import constant, halved, place, read, sampling, wide
 from torchfovea.sensing.triangles import from_triangles
 from torchfovea.setting import require
 
@@ -216,6 +216,9 @@ def _halve_along(image: Tensor, dim: int) -> Tensor:
 
 def _pyramid(image: Tensor, levels: int) -> Tensor:
     """Levels 1…`levels` of the pyramid, one below the other."""
+    fast = halved(image, levels)
+    if fast is not None:
+        return fast
     pyramid = [halve(image)]
     for _ in range(levels - 1):
         pyramid.append(halve(pyramid[-1]))

@@ -1,4 +1,4 @@
-"""Where a retina reads an image and the pyramid above it, and the reading, by kornia."""
+"""Where a retina reads an image and the pyramid above it, and the reading, by kornia or by loops in C."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchfovea.machine import Loops, loops
 from torchfovea.sensing.layout import Retina
 
-__all__ = ["Sampling", "constant", "place", "read", "sampling", "wide"]
+__all__ = ["Sampling", "constant", "halved", "place", "read", "sampling", "wide"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -61,12 +62,47 @@ def place(plan: Sampling, gaze_px: Tensor) -> Tensor:
 
 def read(image: Tensor, maps: Tensor) -> Tensor:
     """(B, C, G, P) of images (B, C, H, W) at places (2, B or 1, G, P), the border's value beyond it."""
+    library = loops(image, maps)
+    if library is not None:
+        return _by_loops(library, image, maps)
     # kornia takes as long to import as this whole package; only who looks needs it
     from kornia.geometry.transform import remap
 
     x, y = maps
     seen: Tensor = remap(image, x, y, padding_mode="border", align_corners=True, normalized_coordinates=True)
     return seen
+
+
+def _by_loops(library: Loops, image: Tensor, maps: Tensor) -> Tensor:
+    """`read` by the loop of sampling.c."""
+    x, y = maps.expand(-1, len(image), -1, -1)
+    seen = image.new_empty(*image.shape[:2], *x.shape[1:])
+    library("read_bilinear", _planes(image.contiguous()), image.shape[1], (x, y, *x.shape, *x.stride()), seen)
+    return seen
+
+
+def halved(image: Tensor, levels: int) -> Tensor | None:
+    """Levels 1…`levels` of the pyramid of images (B, C, H, W), one below the other, by the loop of sampling.c.
+
+    None where there is no such loop, see `torchfovea.machine.loops`.
+    """
+    library = loops(image)
+    if library is None:
+        return None
+    level, heights = image.contiguous(), [image.shape[-2]]
+    for _ in range(levels):
+        heights.append((heights[-1] + 1) // 2)
+    pyramid = image.new_empty(*image.shape[:2], sum(heights[1:]), (image.shape[-1] + 1) // 2)
+    for rows in pyramid.split(heights[1:], -2):
+        if not library("halve", _planes(level), rows, rows.stride(1), rows.stride(2)):
+            raise MemoryError("halve")
+        level = rows[..., : (level.shape[-1] + 1) // 2]
+    return pyramid
+
+
+def _planes(image: Tensor) -> tuple[int | Tensor, ...]:
+    """Images (B, C, H, W) as sampling.c wants them, whose rows may be parts of longer ones."""
+    return (image.shape[:2].numel(), *image.shape[2:], *image.stride()[1:3], image)
 
 
 @constant

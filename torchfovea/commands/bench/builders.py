@@ -69,7 +69,7 @@ def builders_of(cfg: DictConfig, device: str, wanted: Sequence[str]) -> list[Cal
         return saccade(plain, cells_of(cfg), device)._replace(compile=mode)
 
     builders: list[tuple[tuple[str, ...], Callable[[], list[Path]]]] = [
-        (("retina",), lambda: path_of_retina(_log_polar(full), source, batch, device)),
+        (("retina",), lambda: path_of_retina(_log_polar(full), source, batch, device, mode)),
         (PATHS[1:4], lambda: paths_of_look(look())),
         (PATHS[4:6], lambda: paths_of_steps(look(), full)),
         (("step",), lambda: [batched_steps(small, cells_of(few), batch, device)]),

@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchfovea.commands.bench.timing import Growth, Path, Peer, nbytes, same
+from torchfovea.compiling import compiling
 from torchfovea.sensing.layout import LogPolar
 from torchfovea.sensing.retina import fovea
 
@@ -92,7 +93,7 @@ def _picture(size: int) -> Tensor:
     return (torch.stack(waves)[None] + 1) / 2
 
 
-def path_of_retina(retina: LogPolar, size: int, batch: int, device: str) -> list[Path]:
+def path_of_retina(retina: LogPolar, size: int, batch: int, device: str, compile: str = "off") -> list[Path]:
     """One picture, and a batch of them.
 
     Args:
@@ -100,6 +101,7 @@ def path_of_retina(retina: LogPolar, size: int, batch: int, device: str) -> list
         size: of the pictures [px].
         batch: how many pictures.
         device: ours and kornia's.
+        compile: whether and how loops in C are timed, too.
     """
     kernel = torch.tensor([1.0, 3, 3, 1], device=device) / 8
     kernel = (kernel[:, None] * kernel).expand(3, 1, 4, 4).contiguous()
@@ -116,6 +118,7 @@ def path_of_retina(retina: LogPolar, size: int, batch: int, device: str) -> list
         opencv = Peer("cv2: pyramid, remap", partial(_all_by_opencv, arrays, plan, retina.count))
         kornia = Peer("kornia: pyramid, remap", partial(_by_kornia, image, plan, places, kernel))
         ours = partial(fovea, image, None, retina)
+        fast = () if compile == "off" else (Peer("ours, compiled", partial(_compiled, ours, compile)),)
         sizes = tuple(retina.count // share for share in (4, 2, 1))
         runs = tuple(partial(fovea, image, None, LogPolar(count)) for count in sizes)
         paths.append(
@@ -124,7 +127,7 @@ def path_of_retina(retina: LogPolar, size: int, batch: int, device: str) -> list
                 f"{pictures} of 3 x {size} x {size} by {retina.count} RFs",
                 device,
                 ours,
-                (opencv, kornia) if device == "cpu" else (kornia, opencv),
+                (*((opencv, kornia) if device == "cpu" else (kornia, opencv)), *fast),
                 partial(_check, ours, opencv.run, kornia.run),
                 nbytes(image, ours()),
                 (Growth("RFs", sizes, runs),) if pictures == 1 else (),
@@ -132,6 +135,11 @@ def path_of_retina(retina: LogPolar, size: int, batch: int, device: str) -> list
             )
         )
     return paths
+
+
+def _compiled(work: Callable[[], Any], mode: str) -> Any:
+    with compiling(mode):
+        return work()
 
 
 def _all_by_opencv(images: list[np.ndarray], plan: list[_Level], count: int) -> np.ndarray:
