@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from torchfovea.arena import Arenas
+from torchfovea.compiling import compiling
 from torchfovea.perception import Observer
 from torchfovea.sensing.camera import Pinhole
 from torchfovea.sensing.fields import draw_fields
@@ -19,7 +20,7 @@ from torchfovea.sim.model import EgoPose
 from torchfovea.sim.rays import cast
 from torchfovea.sim.scene import AttentionWorld, build_scene, stand_at
 from torchfovea.sim.solids import solids_of
-from torchfovea.sim.trace import occluded, trace
+from torchfovea.sim.trace import occluded, ranges, trace
 from torchfovea.sim.world import World
 
 
@@ -54,6 +55,34 @@ def test_the_same_surfaces_as_mujoco(scenes, gaze, fov_deg):
         seen = world.correspond(Gaze(*(a[b] for a in gaze)), observer.camera.rays(px))
         ahead = ((points[b] - pose.t_right[b]) * pose.R_right[b, :, 2]).sum(-1) > 0
         assert torch.equal(seen.visible_right, (geom[b] >= 0) & ~hidden[b] & ahead)
+
+
+@pytest.mark.parametrize("kind", [torch.float32, torch.float64])
+def test_loops_meet_what_tensors_meet(scenes, kind):
+    """Rays in all directions, from the middle and from above a thing, along the axes and down its own."""
+    rng, solids = torch.Generator().manual_seed(0), solids_of(scenes, dtype=kind)
+    spread = torch.randn(3, 3000, 3, generator=rng, dtype=torch.float64)
+    axes = torch.cat([torch.eye(3), -torch.eye(3)]).double().expand(3, 6, 3)
+    above = torch.tensor([[0.0, 0, -1], [1e-9, 0, -1]]).double().expand(3, 2, 3)
+    direction = torch.cat([spread, axes, above], 1).to(kind)
+    c, s = solids.rotation[..., 0]
+    x, y = (solids.cylinders.centre[k, :, 0, 0] - solids.translation[k, :, 0] for k in (0, 1))
+    over = torch.stack([c * x + s * y, c * y - s * x, 0.2 + 0 * x], -1)
+    for origin in (torch.zeros_like(over), over):
+        told = []
+        for mode in ("off", "on"):
+            with compiling(mode):
+                range_m = ranges(solids, origin, direction)
+                unit = torch.nn.functional.normalize(direction, dim=-1)
+                told.append(
+                    (range_m, occluded(solids, 0.9 * origin, origin[:, None] + 0.999 * range_m[..., None] * unit))
+                )
+        (one, hidden), (other, same) = told
+        # grazing rays are met, or not, by rounding
+        near = (one - other).abs() <= (1e-4 if kind == torch.float32 else 1e-9) * one
+        assert near.double().mean() > (0.995 if kind == torch.float32 else 0.9999)
+        assert (hidden == same).double().mean() > 0.995 and bool(near[:, -8:].all())
+    assert bool(hidden.any())
 
 
 def test_float32_is_near_float64(scenes, gaze):

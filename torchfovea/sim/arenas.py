@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchfovea.arena import Fixation
+from torchfovea.compiling import compiling
 from torchfovea.memory.classes import Classes
 from torchfovea.perception import Observer
 from torchfovea.search import Look, Move
@@ -145,7 +146,8 @@ class GeometricArenas:
         some = any(index is not None for index in chosen)
         if some:
             left_px = left_px[torch.stack([index for index in chosen if index is not None]).to(device)]
-        points, visible, geom = self._surfaces(gaze, observer.camera.rays(left_px))
+        with compiling(observer.compile):
+            points, visible, geom = self._surfaces(gaze, observer.camera.rays(left_px))
         matches = correspond_points(points, visible, left_px, pose, observer.camera, observer.retina, observer.budget)
         matches = with_noise(matches, observer.retina, generators)
         if self.mark is not None and observer.classes is not None:

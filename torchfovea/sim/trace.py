@@ -12,6 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchfovea.machine import loops
 from torchfovea.setting import require
 from torchfovea.sim.solids import Group, Solids, chord, first, tiny, way_out
 
@@ -93,7 +94,10 @@ def trace(solids: Solids, origin_e: Tensor, directions_e: Tensor) -> tuple[Tenso
     Raises:
         SettingError: for an origin outside of its room, and directions that are zero or not finite.
     """
-    range_m, leave, rays, met = _ranges(solids, origin_e, directions_e)
+    rays, leave, range_m = _shell(solids, origin_e, directions_e)
+    met = _pairs(solids, rays)
+    for pairs in met:
+        range_m.view(-1).scatter_reduce_(0, pairs.ray, first(pairs.entry, pairs.exit), "amin")
     # by which face the room is left
     geom = torch.zeros_like(range_m, dtype=torch.int64)
     for axis, (face, ahead) in enumerate(zip(solids.faces.view(3, 2, -1, 1), rays.direction, strict=True)):
@@ -107,11 +111,12 @@ def trace(solids: Solids, origin_e: Tensor, directions_e: Tensor) -> tuple[Tenso
 
 def ranges(solids: Solids, origin_e: Tensor, directions_e: Tensor) -> Tensor:
     """The ranges of `trace` alone."""
-    return _ranges(solids, origin_e, directions_e)[0]
+    rays, _, range_m = _shell(solids, origin_e, directions_e)
+    return _meet(solids, rays, range_m)
 
 
-def _ranges(solids: Solids, origin_e: Tensor, directions_e: Tensor) -> tuple[Tensor, list[Tensor], _Rays, list[_Pairs]]:
-    """Ranges (B, N), where each pair of faces is left, and what led there."""
+def _shell(solids: Solids, origin_e: Tensor, directions_e: Tensor) -> tuple[_Rays, list[Tensor], Tensor]:
+    """Rays, where they leave each pair of the room's faces, and the room, (B, N)."""
     directions_e = directions_e.to(solids.rotation)
     length = (directions_e * directions_e).sum(-1).sqrt()  # vector_norm takes forty times as long over strided axes
     whole = bool(((length > 0) & (length < torch.inf)).all())
@@ -121,11 +126,22 @@ def _ranges(solids: Solids, origin_e: Tensor, directions_e: Tensor) -> tuple[Ten
     inside = bool(torch.stack([h - o.abs() for h, o in zip(solids.half, offset, strict=True)]).amin() > 0)
     require(inside, "origin", "an eye outside of the room", "eyes inside")
     leave = [way_out(o, h, d) for o, h, d in zip(offset, solids.half, rays.direction, strict=True)]
-    best = torch.minimum(torch.minimum(leave[0], leave[1]), leave[2])
-    met = _pairs(solids, rays)
-    for pairs in met:
-        best.view(-1).scatter_reduce_(0, pairs.ray, first(pairs.entry, pairs.exit), "amin")
-    return best, leave, rays, met
+    return rays, leave, torch.minimum(torch.minimum(leave[0], leave[1]), leave[2])
+
+
+def _meet(solids: Solids, rays: _Rays, range_m: Tensor) -> Tensor:
+    """Ranges (B, N), lowered to where rays meet something that stands in the room."""
+    library = loops(range_m)
+    if library is None:
+        for pairs in _pairs(solids, rays):
+            range_m.view(-1).scatter_reduce_(0, pairs.ray, first(pairs.entry, pairs.exit), "amin")
+        return range_m
+    origin, direction = torch.stack(rays.origin), torch.stack(rays.direction)
+    for shape, (_, group) in enumerate(solids.groups):
+        parts = (part.contiguous() for part in (group.centre, group.size, group.turn))
+        given = (*group.geom.shape, range_m.shape[-1], origin, direction, *parts, tiny(range_m.dtype))
+        library("meet", given, shape, range_m)
+    return range_m
 
 
 def occluded(solids: Solids, origin_e: Tensor, points_e: Tensor) -> Tensor:
@@ -142,9 +158,5 @@ def occluded(solids: Solids, origin_e: Tensor, points_e: Tensor) -> Tensor:
     line = points_e.to(dtype) - origin_e.to(dtype)[:, None]
     away = (line * line).sum(-1).sqrt()
     rays = _world(solids, origin_e, line / away.clamp(min=tiny(dtype))[..., None])
-    hidden = torch.zeros(away.numel(), dtype=torch.bool, device=away.device)
     # a point's own surface is met at the point itself, but for rounding at grazing incidence
-    limit = (away - (1e-5 + 1e-5 * away)).reshape(-1)
-    for ray, _, entry, leave in _pairs(solids, rays):
-        hidden[ray[first(entry, leave) < limit.index_select(0, ray)]] = True
-    return hidden.reshape(away.shape)
+    return _meet(solids, rays, torch.full_like(away, torch.inf)) < away - (1e-5 + 1e-5 * away)
