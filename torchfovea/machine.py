@@ -72,10 +72,11 @@ def loops(*tensors: Tensor | None) -> Loops | None:
     Raises:
         SettingError: with `compile` on, where there is no C compiler, or it fails.
     """
+    # what traces comes first: it cannot follow the rest
+    if torch.compiler.is_compiling() or not is_compiling() or torch._C._functorch.peek_interpreter_stack():
+        return None
     given = [t for t in tensors if t is not None]
     kind = given[0].dtype
-    if not is_compiling() or torch.compiler.is_compiling() or torch._C._functorch.peek_interpreter_stack():
-        return None
     if kind not in _REALS or any(t.device.type != "cpu" or t.dtype != kind for t in given):
         return None
     if (torch.is_grad_enabled() and wants_gradient(given)) or torch.autograd.forward_ad._current_level >= 0:
