@@ -9,7 +9,7 @@ import torchfovea as tf
 from torchfovea import metrics
 from torchfovea.deciding import reward
 from torchfovea.deciding.acquisition import best_of
-from torchfovea.gaussian import Gaussian, Information, columns, positive_definite
+from torchfovea.gaussian import Gaussian, Information, columns, gaussian_from_information, positive_definite
 from torchfovea.memory.egosphere import (
     Fusion,
     Prior,
@@ -20,11 +20,14 @@ from torchfovea.memory.egosphere import (
     reducible,
     trust,
 )
-from torchfovea.memory.pooling import Pooled, found_points, nearness, share_errors
+from torchfovea.memory.pooling import Pooled, add_common, found_points, nearness, pool, share_errors
 from torchfovea.memory.sphere import fibonacci_directions
 from torchfovea.memory.update import remember
+from torchfovea.sensing.camera import Pinhole
+from torchfovea.sensing.correspondence import Correspondences
+from torchfovea.sensing.head import Gaze, Head, eyes
 from torchfovea.sensing.kinship import Kinship
-from torchfovea.sensing.triangulation import Observations, triangulate_rectified
+from torchfovea.sensing.triangulation import Observations, observe, triangulate_rectified
 from torchfovea.sensing.unscented import SigmaPoints, sigma_root
 from torchfovea.setting import SettingError
 
@@ -328,3 +331,58 @@ def test_the_midpoint_method_is_integrated_to_fourth_order():
     mean = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
     _, variance, _ = tf.unscented_transform(inverse, mean, root, SigmaPoints.midpoint())
     assert variance.item() == pytest.approx(error**2 * (1 + 4 * error**2), rel=1e-3)
+
+
+def test_what_points_have_in_common_adds_to_their_covariance():
+    """In the Cartesian chart; a cell without any stays as it is."""
+    mean = torch.tensor([[0.3, 0.2, 2.0], [0.1, -0.4, 1.5]], dtype=torch.float64)
+    cov = torch.tensor([[4e-3, 1e-3, 0, 5e-3, 0, 9e-3], [2e-3, 0, 1e-3, 3e-3, 0, 8e-3]], dtype=torch.float64)
+    common = torch.tensor([1e-3, 2e-4, 0, 2e-3, 0, 3e-3], dtype=torch.float64).expand(3, 6)
+    pooled = pool(Gaussian(mean, cov), torch.tensor([0, 2]), (3,))
+    after = add_common(pooled, common, "cartesian").information
+    found = gaussian_from_information(Information(after.vector[[0, 2]], after.matrix[[0, 2]]))
+    torch.testing.assert_close(found.mean, mean)
+    torch.testing.assert_close(found.cov, cov + common[:2])
+    assert not after.vector[1].any() and not after.matrix[1].any()
+
+
+def test_what_is_surely_an_error_shares_nothing():
+    """With errors in common too: an observation that cannot be true is as one that was never made."""
+    mean = torch.tensor([[0.0, 0, 2], [0, 0, 3]], dtype=torch.float64)
+    cov = torch.tensor([[1e-4, 0, 0, 1e-4, 0, 4e-4], [1e-4, 0, 0, 1e-4, 0, 9e-4]], dtype=torch.float64)
+    support, valid = torch.full((2,), 1e-3, dtype=torch.float64), torch.tensor([True, True])
+    both = Observations(mean, cov, CELLS[[2, 2]], support, valid, inlier=torch.tensor([1.0, 0.0], dtype=torch.float64))
+    one = Observations(*(part[:1] for part in both[:6]))
+    kin = Kinship(torch.full((2,), 0.04, dtype=torch.float64), 0.5, torch.full((2,), 0.3, dtype=torch.float64))
+    alone = kin._replace(patch=kin.patch[:1], lasting=kin.lasting[:1])
+    found, expected = (
+        remember(empty_memory(CELLS, Prior()), seen, Fusion(), kin=known) for seen, known in ((both, kin), (one, alone))
+    )
+    torch.testing.assert_close(found.information.matrix, expected.information.matrix)
+    torch.testing.assert_close(found.information.vector, expected.information.vector)
+    torch.testing.assert_close(found.lasting, expected.lasting)
+
+
+def test_a_receptive_field_is_as_wide_as_its_own_camera_sees_it():
+    left = torch.tensor([[8.0, 3.0], [-5.0, 1.0]], dtype=torch.float64)
+    sigma = torch.full((2,), 0.1, dtype=torch.float64)
+    matches = Correspondences(left, left - torch.tensor([2.0, 0.0]), sigma, sigma, sigma > 0)
+    seen = eyes(Head(), Gaze(*(torch.tensor(v, dtype=torch.float64) for v in (0.1, 0.1, 0.1))))
+    cameras = Pinhole(30.0), Pinhole(40.0, 3.0, 1.0)
+    found, expected = (observe(matches, seen, pair, 2 * sigma) for pair in (cameras, cameras[:1] * 2))
+    assert torch.equal(found.support_rad, expected.support_rad)
+
+
+def test_directions_that_are_no_numbers_are_refused_and_rounding_is_forgiven():
+    mixture = tf.direction_mixture([1.0], [[1.0, 0.0, 0.0]], [[0.1, 0.2, 0.3]], dtype=torch.float64)
+    for value in (math.inf, math.nan):
+        with pytest.raises(SettingError, match="directions = zero or not finite"):
+            tf.log_density(mixture, torch.tensor([[value, 0.0, 1.0]], dtype=torch.float64))
+    for off, fine in ((0.9e-5, True), (1.5e-5, False)):
+        cov = torch.eye(3, dtype=torch.float64)
+        cov[0, 1] = off
+        if fine:
+            tf.direction_mixture([1.0], [[1.0, 0.0, 0.0]], cov[None])
+        else:
+            with pytest.raises(SettingError, match=r"covariances\[0\] = .*expected a symmetric"):
+                tf.direction_mixture([1.0], [[1.0, 0.0, 0.0]], cov[None])
