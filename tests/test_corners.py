@@ -9,7 +9,17 @@ import torchfovea as tf
 from torchfovea import metrics
 from torchfovea.deciding import reward
 from torchfovea.deciding.acquisition import best_of
-from torchfovea.gaussian import Gaussian, Information, columns, gaussian_from_information, positive_definite
+from torchfovea.gaussian import (
+    Gaussian,
+    Information,
+    columns,
+    gaussian_from_information,
+    pack,
+    positive_definite,
+    quadratic3,
+    rotate3,
+    unpack,
+)
 from torchfovea.memory.egosphere import (
     Fusion,
     Prior,
@@ -23,7 +33,7 @@ from torchfovea.memory.egosphere import (
 from torchfovea.memory.pooling import Pooled, add_common, found_points, nearness, pool, share_errors
 from torchfovea.memory.sphere import fibonacci_directions
 from torchfovea.memory.update import remember
-from torchfovea.sensing.camera import Pinhole
+from torchfovea.sensing.camera import Fisheye, Pinhole
 from torchfovea.sensing.correspondence import Correspondences
 from torchfovea.sensing.head import Gaze, Head, eyes
 from torchfovea.sensing.kinship import Kinship
@@ -377,7 +387,7 @@ def test_directions_that_are_no_numbers_are_refused_and_rounding_is_forgiven():
     mixture = tf.direction_mixture([1.0], [[1.0, 0.0, 0.0]], [[0.1, 0.2, 0.3]], dtype=torch.float64)
     for value in (math.inf, math.nan):
         with pytest.raises(SettingError, match="directions = zero or not finite"):
-            tf.log_density(mixture, torch.tensor([[value, 0.0, 1.0]], dtype=torch.float64))
+            tf.log_density(mixture, torch.tensor([[1.0, 0.0, 1.0], [value, 0.0, 1.0]], dtype=torch.float64))
     for off, fine in ((0.9e-5, True), (1.5e-5, False)):
         cov = torch.eye(3, dtype=torch.float64)
         cov[0, 1] = off
@@ -386,3 +396,66 @@ def test_directions_that_are_no_numbers_are_refused_and_rounding_is_forgiven():
         else:
             with pytest.raises(SettingError, match=r"covariances\[0\] = .*expected a symmetric"):
                 tf.direction_mixture([1.0], [[1.0, 0.0, 0.0]], cov[None])
+
+
+def test_quadratic_forms_and_rotations_are_those_of_whole_matrices():
+    generator = torch.Generator().manual_seed(0)
+    sym, vector = (torch.randn(2, 5, n, generator=generator, dtype=torch.float64) for n in (6, 3))
+    turn = torch.linalg.qr(torch.randn(2, 5, 3, 3, generator=generator, dtype=torch.float64)).Q
+    whole = unpack(sym)
+    torch.testing.assert_close(quadratic3(sym, vector), torch.einsum("...i,...ij,...j->...", vector, whole, vector))
+    torch.testing.assert_close(unpack(rotate3(turn, sym)), turn @ whole @ turn.mT)
+    torch.testing.assert_close(rotate3(turn[0, 0], sym), rotate3(turn[0, 0].expand(2, 5, 3, 3), sym))
+
+
+def test_inverse_range_at_a_cell_is_what_the_whole_matrix_says():
+    generator = torch.Generator().manual_seed(1)
+    root = torch.randn(4, 3, 3, generator=generator, dtype=torch.float64)
+    whole, vector = root @ root.mT, torch.randn(4, 3, generator=generator, dtype=torch.float64)
+    for slope, weak in ((0.0, 0.0), (0.7, 0.0), (0.7, 0.2)):
+        added = whole + torch.diag(torch.tensor([slope, slope, weak], dtype=torch.float64))
+        mean, variance = nearness(Information(vector, pack(whole)), slope, torch.tensor(weak, dtype=torch.float64))
+        cov = torch.linalg.inv(added)
+        torch.testing.assert_close(variance, cov[:, 2, 2])
+        torch.testing.assert_close(mean, (cov @ vector[..., None])[:, 2, 0])
+
+
+def test_one_cell_can_be_drawn_and_few_in_a_hundred_thousand_cannot():
+    mixture = tf.direction_mixture([1.0], [[0.0, 0.0, 0.0]], [[1.0, 1.0, 1.0]])
+    assert tf.sample(mixture, 1, 0).shape == (1, 3)
+    with pytest.raises(SettingError, match="cells = 0: expected at least 1"):
+        tf.sample(mixture, 0, 0)
+    with pytest.raises(SettingError, match=r"reachable = \d+ of \d+ directions"):  # one in 20,000
+        tf.sample(mixture, 100, 0, lambda directions: directions[:, 0] > 1 - 1e-4)
+
+
+def test_a_ray_to_the_side_looks_not_ahead():
+    right = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
+    for x, z, ahead in ((1.0, 0.0, False), (1.0, 1e-3, True), (1.0, -1e-3, False)):
+        left = torch.tensor([[x, 0.0, z]], dtype=torch.float64)
+        assert triangulate_rectified(left, right, torch.tensor(0.2, dtype=torch.float64))[2].tolist() == [ahead]
+
+
+def test_of_sigma_points_all_must_look_ahead():
+    """A fisheye's receptive field nearly at 90 degrees: its centre is ahead, one standard deviation further out not."""
+    camera = Fisheye(20.0)
+    left = torch.tensor([[-20.0 * math.radians(89.0), 0.0]] * 2, dtype=torch.float64)
+    sigma = torch.tensor([1e-3, 1.0], dtype=torch.float64)
+    matches = Correspondences(left, left - torch.tensor([0.1, 0.0]), sigma, sigma, sigma > 0)
+    seen = eyes(Head(), Gaze(*(torch.zeros((), dtype=torch.float64) for _ in range(3))))
+    for chart in ("inverse_range", "cartesian"):
+        assert observe(matches, seen, camera, sigma, chart=chart).valid.tolist() == [True, False]
+
+
+def test_windows_and_ranges_end_and_what_votes():
+    for name in ("window", "nearest_m"):
+        with pytest.raises(SettingError, match=f"fusion.{name} = inf"):
+            Fusion(**{name: math.inf})
+    assert Fusion().votes and not Fusion(conflict=math.inf).votes and not Fusion("aligned").votes
+
+
+def test_an_incumbent_belongs_to_a_row():
+    mean = torch.zeros(4)
+    for given in (torch.zeros(4), torch.zeros(1)):
+        with pytest.raises(SettingError, match=r"incumbent.shape"):
+            tf.expected_improvement(mean, mean + 1, given)
