@@ -30,7 +30,7 @@ from torchfovea.memory.egosphere import (
     reducible,
     trust,
 )
-from torchfovea.memory.pooling import Pooled, add_common, found_points, nearness, pool, share_errors
+from torchfovea.memory.pooling import Pooled, add_common, found_points, nearness, pool, pool_patches, share_errors
 from torchfovea.memory.sphere import fibonacci_directions
 from torchfovea.memory.update import remember
 from torchfovea.sensing.camera import Fisheye, Pinhole
@@ -459,3 +459,31 @@ def test_an_incumbent_belongs_to_a_row():
     for given in (torch.zeros(4), torch.zeros(1)):
         with pytest.raises(SettingError, match=r"incumbent.shape"):
             tf.expected_improvement(mean, mean + 1, given)
+
+
+def test_where_a_saccade_alone_saw_a_patch():
+    """Of one observation beside its cell's middle, on a slope that nobody knows; beyond infinity as far as can be."""
+    row = torch.nn.functional.normalize(torch.tensor([[0.1, -0.05, 1.0]], dtype=torch.float64), dim=-1)
+    one, slope_std = torch.ones(1, dtype=torch.float64), 0.5
+    for rho, far_m in ((0.4, 1000.0), (-0.4, 1000.0), (-0.4, 50.0)):
+        pooled = pool_patches(rho * one, 0.01 * one, 100 * one, row, one, torch.tensor([1]), (3,))
+        matrix = unpack(pooled.information.matrix[1]) + torch.diag(torch.tensor([4.0, 4.0, 0.0], dtype=torch.float64))
+        there = float(torch.linalg.solve(matrix, pooled.information.vector[1])[2])
+        points = found_points(pooled, CELLS[:3], "inverse_range", slope_std, far_m)
+        torch.testing.assert_close(points[1], CELLS[1] / max(there, 1 / far_m))
+        assert torch.equal(points[[0, 2]], CELLS[[0, 2]])
+
+
+def test_what_lasts_weighs_as_the_look_does_on_a_slope_too():
+    """1/u of a look by itself: its own variance, and that of the slope from where it looked to the cell's middle."""
+    prior = Prior(slope_std=0.6)
+    beside = torch.nn.functional.normalize(CELLS[[2]] + torch.tensor([0.02, -0.03, 0.01], dtype=torch.float64), dim=-1)
+    mean, cov = torch.tensor([[0.0, 0, 2]], dtype=torch.float64), torch.tensor([[1e-9, 0, 0, 1e-9, 0, 4e-4]])
+    support, patch = torch.full((1,), 1e-3, dtype=torch.float64), torch.full((1,), 1e-9, dtype=torch.float64)
+    look = Observations(mean, cov.double(), beside, support, torch.tensor([True]))
+    memory = remember(empty_memory(CELLS, prior), look, Fusion(), kin=Kinship(patch, 1e-9, 0 * patch + 0.3))
+    cell = int(memory.looks.argmax())
+    cosine = float((beside[0] * CELLS[cell]).sum())
+    # of a plane q·X = 1 the inverse range along the look is ρ cos θ + g sin θ, from which ρ follows
+    variance = (4e-4 + 0.6**2 * (1 - cosine**2)) / cosine**2
+    assert float(memory.lasting[cell, 0]) == pytest.approx((0.3 * 4e-4 / cosine**2) ** 0.5 / variance, rel=1e-3)
