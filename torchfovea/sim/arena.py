@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.arena import Fixation, Truth
+from torchfovea.compiling import compiling
 from torchfovea.looking import Pictures, look_at, told
 from torchfovea.memory.egosphere import Memory
 from torchfovea.memory.moving import Motion
@@ -123,7 +124,8 @@ class SimulatedArena:
         observer = self.observer
         believed, gaze = gaze, self._true(gaze)
         if self.matcher is not None:
-            left, right = (frame.image for frame in self.world.images(gaze))
+            with compiling(observer.compile):
+                left, right = (frame.image for frame in self.world.images(gaze))
             if self.recorder is not None:
                 left, right = as_kept(left), as_kept(right)
                 self.recorder.write(self.seconds, left, right, believed, self.base)
@@ -147,7 +149,8 @@ class SimulatedArena:
         head, camera, retina = self.observer.head, self.observer.camera, self.observer.retina
         views = verged_views(left, right, rig_at(head, gaze), camera, retina.radius_px)
         matcher = told(self.matcher, self.observer, self._memory, eyes(head, gaze))
-        return look_at(self.observer, views, matcher, generator, self.sample)
+        with compiling(self.observer.compile):
+            return look_at(self.observer, views, matcher, generator, self.sample)
 
     def truth(self, cells: Tensor) -> Truth:
         """What the judge knows as the robot stands now: the nearest point, and the surface behind each cell (Nx, 3)."""
@@ -157,7 +160,8 @@ class SimulatedArena:
 def look_together(arenas: Sequence[SimulatedArena], gaze: Gaze, generators: Sequence[torch.Generator]) -> Look:
     """Looks of photometric arenas at B gazes, as `torchfovea.arena.Arenas` has them; drawn together, not recorded."""
     gazes = [Gaze(*(angle[b] for angle in gaze)) for b in range(len(arenas))]
-    images = images_together([a.world for a in arenas], [a._true(g) for a, g in zip(arenas, gazes, strict=True)])
+    with compiling(arenas[0].observer.compile):
+        images = images_together([a.world for a in arenas], [a._true(g) for a, g in zip(arenas, gazes, strict=True)])
     looks = [
         arena.match(left.image, right.image, own, generator)
         for arena, (left, right), own, generator in zip(arenas, images, gazes, generators, strict=True)
