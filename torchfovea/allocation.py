@@ -1,8 +1,8 @@
 """Keep memory that is freed, for the next time it is asked for.
 
 OpenCV's semi-global matcher asks for tens or hundreds of megabytes for every pair and gives them back. The C library
-returns blocks that large to the system, which fills them with zeros, page by page, when it hands them out anew: 40% of
-the matcher's time.
+returns blocks that large to the system, which fills them with zeros, page by page, when it hands them out anew: a
+third of the matcher's time.
 """
 
 from __future__ import annotations

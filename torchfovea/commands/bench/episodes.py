@@ -5,6 +5,7 @@ Every function takes the command's configuration and the observer it describes, 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -59,21 +60,29 @@ def photometric_saccade(cfg: DictConfig, observer: Observer) -> Path:
     """All of a photometric saccade: both eyes' pictures by rays, matching, triangulation, memory, decision."""
     settings = OmegaConf.merge(cfg, {"fidelity": "photometric", "sensor": {"sample": None}})
     assert isinstance(settings, DictConfig)
-    arena, generator = build_arena(settings, observer, int(cfg.seed)), torch.Generator().manual_seed(int(cfg.seed))
+    generator = torch.Generator().manual_seed(int(cfg.seed))
     memory = new_memory(observer, build_cells(cfg, observer.head, generator))
     zero = torch.zeros(())
     gaze = Gaze(zero, zero + 0.3, zero + 0.1)
 
-    def saccade() -> Step:
-        look = arena.look(gaze, generator)
-        return decide(observer, perceive(observer, memory, look.matches, eyes(observer.head, gaze)), generator)
+    def of(observer: Observer) -> Callable[[], Step]:
+        arena = build_arena(settings, observer, int(cfg.seed))
+
+        def saccade() -> Step:
+            look = arena.look(gaze, generator)
+            return decide(observer, perceive(observer, memory, look.matches, eyes(observer.head, gaze)), generator)
+
+        return saccade
+
+    ours = of(observer)
 
     def check() -> None:
-        if int(saccade().cell) < 0:
+        if int(ours().cell) < 0:
             raise RuntimeError("saccade: nothing to fixate")
 
-    work = f"two pictures of {arena.world.source_px} px by rays, {cfg.matcher.name}, to the next fixation"
-    return Path("saccade", work, "cpu", saccade, (), check)
+    quick = () if cfg.compile == "off" else (Peer("ours, compiled", of(compiled(observer, cfg.compile))),)
+    work = f"two pictures of {int(cfg.sensor.source_px)} px by rays, {cfg.matcher.name}, to the next fixation"
+    return Path("saccade", work, "cpu", ours, quick, check)
 
 
 def episode(cfg: DictConfig, observer: Observer, batch: int, device: str, compile: str = "off") -> Path:
