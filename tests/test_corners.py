@@ -457,21 +457,40 @@ def test_windows_and_ranges_end_and_what_votes():
 def test_an_incumbent_belongs_to_a_row():
     mean = torch.zeros(4)
     for given in (torch.zeros(4), torch.zeros(1)):
-        with pytest.raises(SettingError, match=r"incumbent.shape"):
+        with pytest.raises(SettingError, match=r"incumbent.shape = .*: expected \(\), one for each row"):
             tf.expected_improvement(mean, mean + 1, given)
+    with pytest.raises(SettingError, match=r"incumbent.shape = \(3,\): expected \(2,\), one for each row"):
+        tf.expected_improvement(mean.expand(2, 4), mean.expand(2, 4) + 1, torch.zeros(3))
 
 
 def test_where_a_saccade_alone_saw_a_patch():
-    """Of one observation beside its cell's middle, on a slope that nobody knows; beyond infinity as far as can be."""
-    row = torch.nn.functional.normalize(torch.tensor([[0.1, -0.05, 1.0]], dtype=torch.float64), dim=-1)
-    one, slope_std = torch.ones(1, dtype=torch.float64), 0.5
-    for rho, far_m in ((0.4, 1000.0), (-0.4, 1000.0), (-0.4, 50.0)):
-        pooled = pool_patches(rho * one, 0.01 * one, 100 * one, row, one, torch.tensor([1]), (3,))
+    """By two observations beside its cell's middle, on a slope that nobody knows; beyond infinity as far as can be."""
+    rows = torch.tensor([[0.1, -0.05, 1.0], [-0.2, 0.1, 1.0]], dtype=torch.float64)
+    rows, one = torch.nn.functional.normalize(rows, dim=-1), torch.ones(2, dtype=torch.float64)
+    for sign, far_m in ((1, 1000.0), (-1, 1000.0), (-1, 50.0)):
+        rho = sign * torch.tensor([0.4, 0.7], dtype=torch.float64)
+        pooled = pool_patches(rho, 0.01 * one, 100 * one, rows, one, torch.tensor([1, 1]), (3,))
         matrix = unpack(pooled.information.matrix[1]) + torch.diag(torch.tensor([4.0, 4.0, 0.0], dtype=torch.float64))
         there = float(torch.linalg.solve(matrix, pooled.information.vector[1])[2])
-        points = found_points(pooled, CELLS[:3], "inverse_range", slope_std, far_m)
+        points = found_points(pooled, CELLS[:3], "inverse_range", 0.5, far_m)
         torch.testing.assert_close(points[1], CELLS[1] / max(there, 1 / far_m))
         assert torch.equal(points[[0, 2]], CELLS[[0, 2]])
+
+
+def test_what_a_look_has_in_common_makes_it_say_less():
+    """1/(u + c) of a variance u, beside another c that all of the look shares."""
+    one = Observations(
+        torch.tensor([[0.0, 0, 2]], dtype=torch.float64),
+        torch.tensor([[1e-9, 0, 0, 1e-9, 0, 4e-4]], dtype=torch.float64),
+        CELLS[[2]],
+        torch.full((1,), 1e-3, dtype=torch.float64),
+        torch.tensor([True]),
+    )
+    common = torch.tensor([0, 0, 0, 0, 0, 3e-4], dtype=torch.float64).expand(12, 6)
+    empty = empty_memory(CELLS, Prior())
+    for given, variance in ((None, 4e-4), (common, 7e-4)):
+        told = (remember(empty, one, Fusion(), given).information.matrix - empty.information.matrix)[2, 5]
+        assert float(told) == pytest.approx(1 / variance, rel=1e-4)
 
 
 def test_what_lasts_weighs_as_the_look_does_on_a_slope_too():
