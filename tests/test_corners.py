@@ -45,10 +45,11 @@ CELLS = fibonacci_directions(12, torch.float64)
 
 
 def test_one_bad_direction_among_good_ones_is_refused():
-    cells = CELLS.clone()
-    cells[3] *= 1.1
-    with pytest.raises(SettingError, match="cells = directions: expected finite unit vectors"):
-        empty_memory(cells, Prior())
+    for length in (0.9, 1.1):
+        cells = CELLS.clone()
+        cells[3] *= length
+        with pytest.raises(SettingError, match="cells = directions: expected finite unit vectors"):
+            empty_memory(cells, Prior())
 
 
 def test_whole_numbers_are_no_directions_of_cells():
@@ -353,7 +354,7 @@ def test_what_points_have_in_common_adds_to_their_covariance():
     found = gaussian_from_information(Information(after.vector[[0, 2]], after.matrix[[0, 2]]))
     torch.testing.assert_close(found.mean, mean)
     torch.testing.assert_close(found.cov, cov + common[:2])
-    assert not after.vector[1].any() and not after.matrix[1].any()
+    assert not after.vector[1].any() and not after.matrix[1].any() and not pooled.bearing.any()
 
 
 def test_what_is_surely_an_error_shares_nothing():
@@ -506,3 +507,18 @@ def test_what_lasts_weighs_as_the_look_does_on_a_slope_too():
     # of a plane q·X = 1 the inverse range along the look is ρ cos θ + g sin θ, from which ρ follows
     variance = (4e-4 + 0.6**2 * (1 - cosine**2)) / cosine**2
     assert float(memory.lasting[cell, 0]) == pytest.approx((0.3 * 4e-4 / cosine**2) ** 0.5 / variance, rel=1e-3)
+
+
+def test_what_is_in_common_is_added_to_each_of_a_batch():
+    generator = torch.Generator().manual_seed(2)
+    rows = torch.nn.functional.normalize(torch.randn(40, 3, generator=generator, dtype=torch.float64), dim=-1)
+    one, cell = torch.ones(40, dtype=torch.float64), torch.arange(40) % 6
+    common = torch.rand(2, 3, 1, generator=generator, dtype=torch.float64) * torch.tensor([1e-3, 0, 0, 1e-3, 0, 2e-3])
+    together = add_common(
+        pool_patches(0.5 * one, 0.01 * one, 9 * one, rows, one, cell, (2, 3)), common, "inverse_range"
+    )
+    alone = add_common(
+        pool_patches(0.5 * one, 0.01 * one, 9 * one, rows, one, cell, (6,)), common.reshape(6, 6), "inverse_range"
+    )
+    for found, expected in zip(together.information, alone.information, strict=True):
+        torch.testing.assert_close(found.reshape(expected.shape), expected)
