@@ -25,11 +25,15 @@ __all__ = ["BLOCK_PX", "field_clues", "read_clues"]
 BLOCK_PX = 5.0
 """A neighbourhood reaches at least this far [px]: a matcher's block smears a depth edge over about its side."""
 
+REACH_PX = 5.0  # for each standard deviation of misfit: about a block
+FARTHEST_PX = 35.0  # as far as SGBM was seen to extend a rim over a plain wall
 DIRECTIONS = 8  # places around a reading, in opposite pairs
 REACH_WIDTHS = 3.0  # just past the window of five RFs that the sweep refines with
 
 
-def read_clues(disparity: Disparity, place: Tensor, shift: Tensor, width_px: Tensor) -> Clues:
+def read_clues(
+    disparity: Disparity, place: Tensor, shift: Tensor, width_px: Tensor, misfit: Tensor | None = None
+) -> Clues:
     """Clues at places of a disparity map.
 
     Args:
@@ -37,16 +41,23 @@ def read_clues(disparity: Disparity, place: Tensor, shift: Tensor, width_px: Ten
         place: (N, 2), where it was read [px of the map].
         shift: (N,), what was read there [px].
         width_px: (N,), the receptive field's width there [px of the map].
+        misfit: (N,), how far the images' difference there stands out from their noise, in standard deviations
+            (`torchfovea.stereo.readings.standing_out`); None: not asked.
 
     Returns:
         Clues (N,): the bend is the largest difference of the reading from the mean of two opposite places, both with a
-        disparity, on a circle of radius √(width² + BLOCK_PX²); the fringe is the largest by which it is nearer than
-        that; the gap is that radius times the share of places without. What is hidden is the map's rivals.
+        disparity, on a circle of radius √(width² + BLOCK_PX² + reach²); the fringe is the largest by which it is
+        nearer than that; the gap is that radius times the share of places without. What is hidden is the map's rivals.
+        The reach is REACH_PX for each standard deviation of misfit, FARTHEST_PX at most: where there is little texture,
+        matchers extend a near thing far beyond its rim, and what it covers there differs by more than noise.
     """
     height, width = disparity.disparity.shape
     # NaN where there is no disparity, and around the map
     told = F.pad(torch.where(disparity.valid, disparity.disparity, math.nan), (1, 1, 1, 1), value=math.nan).flatten()
-    radius = (width_px.square() + BLOCK_PX**2).sqrt()
+    square = width_px.square() + BLOCK_PX**2
+    if misfit is not None:
+        square = square + (REACH_PX * misfit).clamp(max=FARTHEST_PX).square()
+    radius = square.sqrt()
     x, y = place.unbind(-1)
     angle = math.tau * torch.arange(DIRECTIONS, device=radius.device, dtype=radius.dtype)[:, None] / DIRECTIONS
     column = torch.addcmul(x, radius, angle.cos()).round_().clamp_(-1, width).int()

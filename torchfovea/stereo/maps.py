@@ -27,7 +27,7 @@ from torchfovea.sensing.retina import Retina
 from torchfovea.setting import require
 from torchfovea.stereo.confidence import read_clues
 from torchfovea.stereo.costs import left_eye
-from torchfovea.stereo.readings import refine_reading
+from torchfovea.stereo.readings import refine_reading, standing_out
 from torchfovea.stereo.rectification import RectifiedPair, image_frame
 from torchfovea.stereo.views import Views
 
@@ -124,7 +124,8 @@ def read_map(
     if frame.looks is not None:
         field = field._replace(image=field.image * frame.looks, valid=field.valid & frame.looks)
     width_px = torch.ones_like(shift) if retina is None else retina.width_px(left_px) * scale
-    clues = read_clues(field, place, shift, width_px)
+    misfit = None if reading is None else standing_out(reading.rest, width_px, found)
+    clues = read_clues(field, place, shift, width_px, misfit)
     if reading is not None:
         clues = clues._replace(noise_px=reading.noise_px, mismatch=reading.mismatch)
     return correspondences(left_px, right_px, found, retina, budget, clues), field._replace(clues=clues)

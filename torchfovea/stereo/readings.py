@@ -13,10 +13,12 @@ import torch
 from torch import Tensor
 
 from torchfovea.stereo.costs import Eye, sheet_depth, sheet_rays
-from torchfovea.stereo.sheets import read_sheet, sheets
+from torchfovea.stereo.sheets import average, read_sheet, sheets
 from torchfovea.stereo.subpixel import Neighbourhood, smoothed, steps_per_width, subpixel
 
-__all__ = ["Reading", "refine_reading"]
+__all__ = ["Reading", "refine_reading", "standing_out"]
+
+WIDER = 2  # cells by which windows for the misfit are wider than the refinement's
 
 
 class Reading(NamedTuple):
@@ -26,11 +28,13 @@ class Reading(NamedTuple):
         shift_px: disparity as it was read, (N,) [px], `doffs` included.
         noise_px: standard deviation that the images leave it [px]; infinite nowhere.
         mismatch: 1 less the correlation of the neighbourhoods.
+        rest: mean square difference that the refinement leaves in windows about twice as wide, 0 where nothing is read.
     """
 
     shift_px: Tensor
     noise_px: Tensor
     mismatch: Tensor
+    rest: Tensor
 
 
 @torch.no_grad()
@@ -55,7 +59,8 @@ def refine_reading(
         edge_px: neighbouring disparities further apart than this are different surfaces.
         move: whether to take the refined disparities, or only what the images say of those that were read.
     """
-    shift, noise, mismatch = shift_px.clone(), torch.zeros_like(shift_px), torch.zeros_like(shift_px)
+    shift, noise = shift_px.clone(), torch.zeros_like(shift_px)
+    mismatch, remains = torch.zeros_like(shift_px), torch.zeros_like(shift_px)
     parts = sheets(eye.retina, 1 / eye.scale, shift_px.device, shift_px.dtype)
     cells = [sheet.px.flatten(0, 1) for sheet in parts]
     values = (told.split([len(own) for own in cells]) for told in read(torch.cat(cells)))
@@ -70,11 +75,47 @@ def refine_reading(
         offset = subpixel(eye, sheet, level * step, width_px * step, trusted, Neighbourhood())
         value = torch.where(offset.value.abs() < 1, offset.value, torch.zeros_like(level))
         by = level - there + value * width_px
-        refined = torch.stack([by, offset.variance.sqrt() * width_px, 1 - offset.correlation], 1)
-        (by, sigma, rest), told = (x[0] for x in read_sheet(sheet, refined, there[None], trusted, edge))
+        weight = trusted.to(by)[:, None]
+        wide = average(torch.cat([offset.rest[:, None] * weight, weight], 1), WIDER, sheet.closed)
+        refined = [
+            by,
+            offset.variance.sqrt() * width_px,
+            1 - offset.correlation,
+            wide[:, 0] / wide[:, 1].clamp(min=1e-3),
+        ]
+        (by, sigma, differs, rest), told = (
+            x[0] for x in read_sheet(sheet, torch.stack(refined, 1), there[None], trusted, edge)
+        )
         told = told & found[sheet.rf]
         if move:
             shift[sheet.rf] += torch.where(told, by, torch.zeros_like(by))
         noise[sheet.rf] = torch.where(told, sigma, edge_px)
-        mismatch[sheet.rf] = torch.where(told, rest, torch.ones_like(rest))
-    return Reading(shift, noise * found, mismatch * found)
+        mismatch[sheet.rf] = torch.where(told, differs, torch.ones_like(differs))
+        remains[sheet.rf] = torch.where(told, rest, torch.zeros_like(rest))
+    return Reading(shift, noise * found, mismatch * found, remains)
+
+
+@torch.no_grad()
+def standing_out(rest: Tensor, width_px: Tensor, found: Tensor) -> Tensor:
+    """How far the images' differences stand out from their noise, in its own standard deviations.
+
+    Most readings are right, and what the images differ by there is noise and what interpolation adds; wider RFs average
+    more of it away. So the noise is the median over RFs of about one width, and its spread the median departure of all
+    RFs from that, both of logarithms. No level of noise need be known.
+
+    Args:
+        rest: mean square differences, (N,) (`Reading.rest`).
+        width_px: of the RFs (N,) [source px].
+        found: bool (N,), which of them have a reading.
+
+    Returns:
+        (N,), standard deviations above the median; 0 below it, and where nothing is read.
+    """
+    told = found & (rest > 0)
+    level = rest.clamp(min=1e-12).log()
+    step = (3 * width_px.clamp(min=1).log2()).round().long()
+    for k in step[told].unique().tolist():
+        alike = step == k
+        level = torch.where(alike, level - level[alike & told].median(), level)
+    spread = 1.4826 * level[told].abs().median() if bool(told.any()) else level.new_ones(())
+    return torch.where(told, level.clamp(min=0) / spread.clamp(min=1e-3), torch.zeros_like(level))

@@ -61,12 +61,14 @@ class Offset(NamedTuple):
         variance: of it, units².
         correlation: of the neighbourhoods there, up to 1; what cannot be trusted correlates with nothing.
         misfit: mean square difference of the images over the 3 × 3 cells about each, whatever their exposures.
+        rest: mean square difference that the step leaves in the neighbourhood.
     """
 
     value: Tensor
     variance: Tensor
     correlation: Tensor
     misfit: Tensor
+    rest: Tensor
 
 
 def subpixel(eye: Eye, sheet: Sheet, surface: Tensor, unit: Tensor, trusted: Tensor, about: Neighbourhood) -> Offset:
@@ -116,10 +118,10 @@ def subpixel(eye: Eye, sheet: Sheet, surface: Tensor, unit: Tensor, trusted: Ten
     expected, doubt = far * far_weight / (1 + far_weight), 1 / (1 + far_weight) + smooth * smooth
     precision = near_weight + 1 / doubt
     value = (near * near_weight + expected / doubt) / precision
-    rest = error - value * pull + value.square() * energy / 4
-    correlation = weight[:, 0] * (1 - (rest / (2 * ll)).clamp(min=0))
+    rest = (error - value * pull + value.square() * energy / 4).clamp(min=0)
+    correlation = weight[:, 0] * (1 - rest / (2 * ll))
     differs = left - mean[:, 0] - gain * (right - mean[:, 1])
-    return Offset(value, 1 / precision, correlation, average(differs.detach().square(), 1, closed))
+    return Offset(value, 1 / precision, correlation, average(differs.detach().square(), 1, closed), rest.detach())
 
 
 @torch.no_grad()
