@@ -25,9 +25,9 @@ def disc_lattice(budget: int) -> tuple[float, tuple[float, float], np.ndarray]:
         steps = np.unique(np.round(radius, 9))
         between = (steps[1:] + steps[:-1]) / 2
         counts = np.searchsorted(np.sort(radius), between)
-        meets = np.abs(counts / budget - 1) <= BUDGET_TOLERANCE
+        meets = np.abs(counts - budget) <= BUDGET_TOLERANCE * budget
         if meets.any():
-            if abs((radius <= ideal).sum() / budget - 1) <= BUDGET_TOLERANCE:
+            if abs((radius <= ideal).sum() - budget) <= BUDGET_TOLERANCE * budget:
                 limit = ideal
             else:
                 limit = between[meets][np.argmin(np.abs(between[meets] - ideal))]

@@ -105,7 +105,7 @@ class LogPolar:
         rings, sectors, count = _log_polar_numbers(self)
         # 2 sectors have no neighbours on either side; an RF as long as a whole ring is wide is no log-polar layout
         budget = self.receptive_fields if self.grid is None else count
-        possible = rings >= 1 and sectors >= 3 and abs(count / budget - 1) <= BUDGET_TOLERANCE
+        possible = rings >= 1 and sectors >= 3 and abs(count - budget) <= BUDGET_TOLERANCE * budget
         squareness = self.aspect if possible else math.inf
         require(
             possible and 1 / ASPECT_TOLERANCE <= squareness <= ASPECT_TOLERANCE,
@@ -283,7 +283,7 @@ def _log_polar_numbers(retina: LogPolar) -> tuple[int, int, int]:
     best = (math.inf, 0, 0)
     for rings in range(max(1, int(ideal / 6)), min(budget, math.ceil(6 * ideal) + 1) + 1):
         for sectors in {budget // rings, math.ceil(budget / rings)}:
-            if abs(rings * sectors / budget - 1) <= BUDGET_TOLERANCE and growth / rings < 300:
+            if abs(rings * sectors - budget) <= BUDGET_TOLERANCE * budget and growth / rings < 300:
                 mismatch = abs(math.log(math.expm1(growth / rings) * sectors / (2 * math.pi)))
                 best = min(best, (mismatch, rings, sectors))
     return best[1], best[2], best[1] * best[2]
