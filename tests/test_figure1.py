@@ -66,7 +66,7 @@ def test_a_pair(tmp_path, drawn, pair):
 
 
 def test_the_end_of_a_search(tmp_path, drawn):
-    words = (*SMALL, "sensor.source_px=120", "sensor.receptive_fields=1500", "figure1=true")
+    words = (*SMALL, "sensor.source_px=200", "sensor.receptive_fields=1500", "figure1=true")
     run("search", *words, "seed=3", f"hydra.run.dir={tmp_path}")
     path, true, clouds, frame = drawn[0]
     assert path == tmp_path / "figure1.png" and len(clouds) == 2
