@@ -41,16 +41,22 @@ class Loops:
         self._library = library
 
     def __call__(self, name: str, *arguments: Any) -> int:
-        """Call a function that returns an int64.
+        """Call a function that returns an int64, negative where memory runs out.
 
         Args:
             name: of the function.
             arguments: contiguous tensors and None, as pointers; floats as double, ints as int64; tuples of all these
                 as pointers to structures.
+
+        Raises:
+            MemoryError: where it runs out.
         """
         function = self._library[name]
         function.restype = ctypes.c_int64
-        return int(function(*map(_argument, arguments)))
+        found = int(function(*map(_argument, arguments)))
+        if found < 0:
+            raise MemoryError(name)
+        return found
 
 
 def _argument(value: Any) -> Any:

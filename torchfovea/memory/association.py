@@ -115,8 +115,6 @@ def _by_loops(
     table = (index.vectors.contiguous(), index.cells.contiguous(), index.link.contiguous(), index.resolution)
     kinds = torch.empty(2, sets * (count + size) + 1, dtype=torch.int64)
     found = library("associate", given, table, *map(float, gates[:2]), int(gates[2]), kinds[0], kinds[1])
-    if found < 0:
-        raise MemoryError("associate")
     return Pairs(kinds[0, :found], kinds[1, :found])
 
 

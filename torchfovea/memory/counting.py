@@ -80,8 +80,7 @@ def count_look(
     numbers = (prior.mean, prior.std, prior.bearing_std, prior.slope_std, fusion.conflict, fusion.window)
     settings = tuple(map(float, (*numbers, fusion.nearest_m)))
     joined = (vector, matrix, bearing, None, None)
-    if not library("remember", look, before, after, joined if join else told, settings):
-        raise MemoryError("remember")
+    library("remember", look, before, after, joined if join else told, settings)
     known = memory._replace(
         information=Information(vector.movedim(0, -1), matrix.movedim(0, -1)),
         bearing=bearing,

@@ -137,7 +137,6 @@ class Fusion:
         require(self.name in names, "fusion.name", self.name, "one of " + ", ".join(names))
         for name in ("gate_deg", "gate_spacing"):
             require(0 <= getattr(self, name) <= 1e6, f"fusion.{name}", getattr(self, name), "0 to 1e6")
-        require(isinstance(self.fill, bool), "fusion.fill", self.fill, "true or false")
         require(self.conflict > 0, "fusion.conflict", self.conflict, "a positive number of standard deviations")
         require(1 <= self.window < math.inf, "fusion.window", self.window, "a number of looks, at least 1")
         require(0 < self.nearest_m < math.inf, "fusion.nearest_m", self.nearest_m, "a positive distance in metres")

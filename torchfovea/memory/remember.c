@@ -168,7 +168,7 @@ static void add(const Look *look, const Sight *s, REAL share, int64_t p, Pooled 
 }
 
 /* A look's votes, counted; what was believed and still is, in `after`; what the look tells, added to `pooled`, which
-may be the same arrays. Whether there was memory for it. */
+may be the same arrays. -1 where memory runs out, else 0. */
 int64_t remember(const Look *look, const Memory *before, Memory *after, Pooled *pooled, const Settings *by) {
     const int64_t cells = look->cells, voting = by->conflict < INFINITY;
     const REAL slope2 = by->slope_std * by->slope_std, conflict2 = by->conflict * by->conflict;
@@ -206,5 +206,5 @@ int64_t remember(const Look *look, const Memory *before, Memory *after, Pooled *
         if (counts) add(look, sights + p, sights[p].inlier, p, pooled);
     }
     free(sights), free(beliefs), free(sums), free(surface), free(anew), free(asked);
-    return room;
+    return room ? 0 : -1;
 }

@@ -256,10 +256,7 @@ def _square(px: Tensor) -> Tensor:
 
 
 def _require_disc(receptive_fields: int, radius_px: float) -> None:
-    whole = isinstance(receptive_fields, int) and not isinstance(receptive_fields, bool)
-    require(
-        whole and receptive_fields >= 16, "sensor.receptive_fields", receptive_fields, "a whole number, at least 16"
-    )
+    require(receptive_fields >= 16, "sensor.receptive_fields", receptive_fields, "a whole number, at least 16")
     require(receptive_fields <= MOST, "sensor.receptive_fields", receptive_fields, f"16 to {MOST}")
     require(1e-6 <= radius_px <= 1e6, "sensor.radius_px", radius_px, "a positive number of pixels, 1e-6 to 1e6")
 

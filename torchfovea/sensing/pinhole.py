@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchfovea.compiling import kernel
 from torchfovea.gaussian import definiteness, rounding_of_minors
-from torchfovea.machine import Loops, columns_of, loops
+from torchfovea.machine import columns_of, loops
 from torchfovea.sensing.unscented import SigmaPoints
 
 __all__ = ["Weights", "fast_observations", "pinhole_observations", "weights_of"]
@@ -58,25 +58,13 @@ def fast_observations(
     library = loops(left_px, right_px, *sigmas, *form)
     if library is None:
         return pinhole_observations(left_px, right_px, sigmas, valid, form, weights, rotated)
-    return _by_loops(library, (left_px, right_px), sigmas, valid, form, weights, rotated)
-
-
-def _by_loops(
-    library: Loops,
-    places: tuple[Tensor, Tensor],
-    sigmas: tuple[Tensor, Tensor],
-    valid: Tensor,
-    form: tuple[Tensor, Tensor, Tensor],
-    weights: Weights,
-    rotated: bool,
-) -> tuple[Tensor, Tensor, Tensor]:
-    shape, like = valid.shape, places[0]
+    shape, like = valid.shape, left_px
     share = 1 - 2 * weights.each if weights.by_axis else 1.0
     numbers = (weights.spread, weights.each, 0.0 if weights.by_axis else weights.rest, share, int(rotated))
     given = (
         shape[:-1].numel(),
         shape[-1],
-        *map(columns_of, places),
+        *map(columns_of, (left_px, right_px)),
         *(sigma.expand(shape).contiguous() for sigma in sigmas),
         valid.contiguous(),
         *(part.expand(*part.shape[: -len(shape)], *shape[:-1], 1).contiguous() for part in form),

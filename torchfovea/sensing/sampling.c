@@ -19,12 +19,12 @@ static REAL smaller(REAL a, REAL b) { return a < b ? a : b; }
 static int64_t kept(int64_t k, int64_t size) { return k < 0 ? 0 : k < size ? k : size - 1; }
 
 /* Weights (1, 3, 3, 1) / 8 along both axes at every second pixel, the border's value beyond it. The rows of the result
-are `stride` numbers apart, its planes `plane`; what is right of it is 0. Whether there was memory for a row. */
+are `stride` numbers apart, its planes `plane`; what is right of it is 0. -1 where memory runs out, else 0. */
 int64_t halve(const Planes *from, REAL *to, int64_t plane, int64_t stride) {
     const int64_t height = from->height, width = from->width, rows = (height + 1) / 2, columns = (width + 1) / 2;
     const int64_t line = from->row;
     REAL *row = malloc((width + 4) * sizeof *row);
-    if (!row) return 0;
+    if (!row) return -1;
     for (int64_t k = 0; k < from->planes * rows; k++) {
         const int64_t j = k % rows;
         const REAL *image = from->image + k / rows * from->plane;
@@ -36,7 +36,7 @@ int64_t halve(const Planes *from, REAL *to, int64_t plane, int64_t stride) {
         for (int64_t i = 0; i < columns; i++) out[i] = (sum[2 * i - 1] + sum[2 * i + 2] + 3 * (sum[2 * i] + sum[2 * i + 1])) / 64;
         for (int64_t i = columns; i < stride; i++) out[i] = 0;
     }
-    return free(row), 1;
+    return free(row), 0;
 }
 
 typedef struct { /* coordinates from -1 to 1 between the border pixels */

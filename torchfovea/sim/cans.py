@@ -74,9 +74,7 @@ class Cans:
     def __post_init__(self) -> None:
         """Raise SettingError for values out of range; lists become tuples."""
         check_types(self, "scene.")
-        require(
-            isinstance(self.cans, int) and 2 <= self.cans <= 40, "scene.cans", self.cans, "a whole number from 2 to 40"
-        )
+        require(2 <= self.cans <= 40, "scene.cans", self.cans, "a whole number from 2 to 40")
         limits = {
             "target_azimuth_deg": (-180, 180), "target_elevation_deg": (-85, 85), "target_range_m": (0.3, 20),
             "azimuth_deg": (-180, 180), "elevation_deg": (-85, 85), "range_m": (0.3, 20),

@@ -43,9 +43,9 @@ class Marked:
     def __post_init__(self) -> None:
         """Raise SettingError for marks that tell nothing apart."""
         check_types(self, "scene.")
-        require(isinstance(self.marks, int) and 2 <= self.marks <= 63, "scene.marks", self.marks, "2 to 63 marks")
-        borne = isinstance(self.sought, int) and 1 <= self.sought <= self.marks
-        require(borne, "scene.sought", self.sought, f"a class that an object has, 1 to {self.marks}")
+        require(2 <= self.marks <= 63, "scene.marks", self.marks, "2 to 63 marks")
+        known = f"a class that an object has, 1 to {self.marks}"
+        require(1 <= self.sought <= self.marks, "scene.sought", self.sought, known)
         require(1e-5 <= self.detail_m <= 1, "scene.detail_m", self.detail_m, "0.00001 to 1 metre")
         require(0 <= self.contrast <= 1, "scene.contrast", self.contrast, "0 to 1")
 

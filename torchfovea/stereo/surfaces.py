@@ -69,8 +69,7 @@ class Sweep:
             value = getattr(self, name)
             require(value in (1, 2, 3), f"matcher.{name}", value, "1, 2 or 3 receptive fields")
         require(0.1 <= self.per_width <= 10, "matcher.per_width", self.per_width, "0.1 to 10")
-        whole = isinstance(self.hypotheses, int) and self.hypotheses >= 8
-        require(whole, "matcher.hypotheses", self.hypotheses, "a whole number, at least 8")
+        require(self.hypotheses >= 8, "matcher.hypotheses", self.hypotheses, "a whole number, at least 8")
         large = self.smooth_small <= self.smooth_large < math.inf
         require(0 <= self.smooth_small < math.inf, "matcher.smooth_small", self.smooth_small, "0 or more")
         require(large, "matcher.smooth_large", self.smooth_large, f"at least smooth_small = {self.smooth_small}")

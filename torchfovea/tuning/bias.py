@@ -55,8 +55,7 @@ class Shape:
     def __post_init__(self) -> None:
         """Raise SettingError for values out of range."""
         check_types(self)
-        good = isinstance(self.components, int) and 1 <= self.components <= 64
-        require(good, "components", self.components, "a whole number from 1 to 64")
+        require(1 <= self.components <= 64, "components", self.components, "a whole number from 1 to 64")
         fine = self.fov_deg is None or _FOV_DEG[0] <= self.fov_deg <= _FOV_DEG[1]
         require(fine, "sensor.fov_deg", self.fov_deg, f"from {_FOV_DEG[0]:.0f} to {_FOV_DEG[1]:.0f} to be tuned")
         require(math.exp(-4) <= self.alpha <= math.exp(4), "acquisition.alpha", self.alpha, "between 0.0183 and 54.6")

@@ -71,7 +71,6 @@ def build_classes(cfg: DictConfig) -> Classes | None:
     if cfg.reward.get("evidence") is None:
         return classes
     made = build_named(cfg, "reward.evidence", EVIDENCE, ())
-    require(callable(made), "reward.evidence", type(made).__name__, EVIDENCE)
     known = made.marks + 1 if isinstance(made, Stripes) else classes.count
     require(classes.count == known, "reward.count", classes.count, f"{known}, one more than reward.evidence's marks")
     return replace(classes, evidence=made)
