@@ -64,8 +64,10 @@ def test_images_are_seen_as_a_cortical_image():
     assert again in env.observation_space and not np.array_equal(seen["retina"], again["retina"])
 
 
-def test_rows_that_are_drawn_together_see_what_one_sees():
-    settings = {"fidelity": "photometric", "overrides": (*TINY["overrides"], "sensor.source_px=60"), "saccades": 3}
+@pytest.mark.parametrize("matcher", ["sgbm", "sweep"])
+def test_rows_that_are_drawn_together_see_what_one_sees(matcher):
+    overrides = (*TINY["overrides"], "sensor.source_px=60", f"matcher={matcher}")
+    settings = {"fidelity": "photometric", "overrides": overrides, "saccades": 3}
     settings |= {"observe": ("retina", "memory")}
     together, alone = vector(2, **settings), single(**settings)
     together.reset(seed=5)

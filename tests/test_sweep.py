@@ -11,11 +11,12 @@ from torchfovea.sensing.head import Eyes
 from torchfovea.sensing.layout import LogPolar, Uniform
 from torchfovea.sensing.triangulation import observe
 from torchfovea.setting import SettingError
-from torchfovea.stereo.rig import StereoRig, posed, verged
+from torchfovea.stereo.matchers import Matcher, match_all
+from torchfovea.stereo.rig import posed, verged
 from torchfovea.stereo.semiglobal import aggregate
 from torchfovea.stereo.sheets import average, nearest_rf, read_sheet, sheets
 from torchfovea.stereo.sweep import Sweep, Volume, match_sweep
-from torchfovea.stereo.views import rectified_views, verged_views
+from torchfovea.stereo.views import batched_views, rectified_views, verged_views
 
 BASELINE_M = 0.2
 RETINAS = [LogPolar(3000), Uniform(3000), LogPolar(3000, uniform_fovea=True)]
@@ -204,27 +205,43 @@ def test_a_rectified_pair_with_different_centres():
     assert (depth[found.valid] - 2.0).abs().median() < 0.05
 
 
-def test_batch_is_a_loop_and_rotations_may_be_batched():
-    rooms = [Room([WALL], vergence=0.1), Room([WALL, BOARD], vergence=0.2, seed=3)]
-    retina = LogPolar(1200)
-    images = [torch.stack(side) for side in zip(*(room.images(64) for room in rooms), strict=True)]
-    rig = StereoRig(*(torch.stack([room.rig[k] for room in rooms]) for k in (0, 1)), BASELINE_M)
-    together, _ = match_sweep(verged_views(*images, rig, rooms[0].camera, 100.0), retina)
-    for k, room in enumerate(rooms):
-        # the densest hypotheses of either pair serve both: equal up to that
-        alone, _ = match_sweep(room.views(images[0][k], images[1][k]), retina)
-        both = alone.valid & together.valid[k]
-        assert (alone.valid == together.valid[k]).double().mean() > 0.9
-        assert (alone.right_px - together.right_px[k]).norm(dim=-1)[both].median() < 0.1
-    same = StereoRig(*(torch.stack([rooms[0].rig[k]] * 2) for k in (0, 1)), BASELINE_M)
-    twice = [torch.stack([image] * 2) for image in rooms[0].images(64)]
-    pair, _ = match_sweep(verged_views(*twice, same, rooms[0].camera, 100.0), retina)
-    one, _ = match_sweep(rooms[0].views(twice[0][0], twice[1][0]), retina)
-    for many, single in zip(pair, one, strict=True):
-        if single is None:
-            assert many is None
-        else:
-            torch.testing.assert_close(many[1], single)
+@pytest.mark.parametrize("retina", [LogPolar(1200), Uniform(1200)], ids=["log_polar", "uniform"])
+def test_batch_is_a_loop(retina):
+    """Of pairs that try different hypotheses, with volumes of interest and without, whatever else they share."""
+    rooms = [Room([WALL], vergence=0.1), Room([WALL, BOARD], vergence=0.25, seed=3), Room([BOARD], vergence=0.1)]
+    views = [room.views(64) for room in rooms]
+    alone = [match_sweep(view, retina) for view in views]
+    volumes = [
+        Volume((found.inverse_range - near).clamp(min=0), found.inverse_range + far)
+        for near, far, (_, found) in zip((0.3, 0.2, 9.0), (0.5, math.inf, math.inf), alone, strict=True)
+    ]
+    for chosen in ([None] * 3, volumes, [None, *volumes[1:]]):
+        matchers = [Matcher(Sweep(), volume=volume) for volume in chosen]
+        one = [match(view, retina, Budget()) for match, view in zip(matchers, views, strict=True)]
+        many = match_all(matchers, views, retina, Budget())
+        for (matches, found), (same, like) in zip(one, many, strict=True):
+            assert torch.equal(matches.valid, same.valid) and matches.valid.any()
+            parts = zip((*matches, *found[:3], *found.clues), (*same, *like[:3], *like.clues), strict=True)
+            for part, other in parts:
+                torch.testing.assert_close(part, other, rtol=1e-9, atol=1e-9)
+
+
+def test_what_cannot_be_one_batch_is_matched_one_by_one():
+    room, retina = Room([WALL]), Uniform(500)
+    small, large, told = room.views(48), room.views(64), []
+
+    def foreign(views, retina, budget):
+        told.append(views.left.shape)
+        return "matches", "found"
+
+    assert match_all([foreign] * 2, [small, large], retina, Budget()) == [("matches", "found")] * 2
+    assert told == [small.left.shape, large.left.shape]
+    sweep, other = Matcher(Sweep()), Matcher(Sweep(window=2))
+    assert batched_views([small, large]) is None and batched_views([small, small]).left.shape == (2, *small.left.shape)
+    for matchers, views in (([sweep] * 2, [small, large]), ([sweep, other], [small] * 2), ([sweep], [large])):
+        found = match_all(matchers, views, retina, Budget())
+        for matcher, view, (matches, _) in zip(matchers, views, found, strict=True):
+            assert torch.equal(matches.right_px, match_sweep(view, retina, matcher.params, Budget())[0].right_px)
 
 
 def test_precision_and_colour(dtype):

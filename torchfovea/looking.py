@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -17,11 +18,11 @@ from torchfovea.sensing.fields import draw_fields, for_all
 from torchfovea.sensing.head import Eyes, to_ego
 from torchfovea.sensing.layout import Retina
 from torchfovea.setting import require
-from torchfovea.stereo.matchers import Match, Narrowed, checked_matches
+from torchfovea.stereo.matchers import Match, Narrowed, checked_matches, match_all
 from torchfovea.stereo.sweep import SweepRange, Volume
 from torchfovea.stereo.views import Views
 
-__all__ = ["Pictures", "look_at", "told"]
+__all__ = ["Pictures", "look_at", "look_at_all", "told"]
 
 
 class Pictures(NamedTuple):
@@ -57,7 +58,26 @@ def look_at(
     Raises:
         SettingError: as the matcher does, and for a matcher, or an evidence of classes, that returns something else.
     """
-    matches, found = checked_matches(matcher(views, observer.retina, observer.budget), observer.retina)
+    return _look(observer, views, matcher(views, observer.retina, observer.budget), generator, sample)
+
+
+def look_at_all(
+    observer: Observer,
+    views: Sequence[Views],
+    matchers: Sequence[Match],
+    generators: Sequence[torch.Generator],
+    sample: int | None = None,
+) -> list[Look]:
+    """`look_at` with several pairs of images, each with its matcher and generator; sweeps match them together."""
+    answers = match_all(matchers, views, observer.retina, observer.budget)
+    return [_look(observer, *each, sample) for each in zip(views, answers, generators, strict=True)]
+
+
+def _look(
+    observer: Observer, views: Views, answer: object, generator: torch.Generator | None, sample: int | None
+) -> Look:
+    """What a matcher's answer comes to."""
+    matches, found = checked_matches(answer, observer.retina)
     if observer.classes is not None:
         matches = matches._replace(classes=_told_of_classes(observer.classes, views, observer.retina, matches))
     if sample is not None:

@@ -218,7 +218,7 @@ class RobotPlaces:
 
 
 class PhotometricPlaces(RobotPlaces):
-    """Scenes rendered for both eyes of all rows together, and matched one row after the other.
+    """Scenes rendered for both eyes of all rows together; the sweep matches them together, others one by one.
 
     Args:
         cfg: of a photometric search.

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchfovea.arena import Fixation, Truth
 from torchfovea.compiling import compiling
-from torchfovea.looking import Pictures, look_at, told
+from torchfovea.looking import Pictures, look_at, look_at_all, told
 from torchfovea.memory.egosphere import Memory
 from torchfovea.memory.moving import Motion
 from torchfovea.perception import Observer
@@ -29,7 +29,7 @@ from torchfovea.sim.walk import Route
 from torchfovea.sim.world import World, images_together
 from torchfovea.stereo.matchers import Match
 from torchfovea.stereo.rig import rig_at
-from torchfovea.stereo.views import verged_views
+from torchfovea.stereo.views import Views, verged_views
 
 __all__ = ["Pictures", "SimulatedArena", "look_together"]
 
@@ -145,12 +145,16 @@ class SimulatedArena:
 
     def match(self, left: Tensor, right: Tensor, gaze: Gaze, generator: torch.Generator) -> Look:
         """What the matcher makes of both eyes' pictures (3, H, W), the head being believed to be at a gaze."""
+        views, matcher = self.task(left, right, gaze)
+        with compiling(self.observer.compile):
+            return look_at(self.observer, views, matcher, generator, self.sample)
+
+    def task(self, left: Tensor, right: Tensor, gaze: Gaze) -> tuple[Views, Match]:
+        """What there is to match, and the matcher, which knows where to look if it asks; see `match`."""
         assert self.matcher is not None
         head, camera, retina = self.observer.head, self.observer.camera, self.observer.retina
         views = verged_views(left, right, rig_at(head, gaze), camera, retina.radius_px)
-        matcher = told(self.matcher, self.observer, self._memory, eyes(head, gaze))
-        with compiling(self.observer.compile):
-            return look_at(self.observer, views, matcher, generator, self.sample)
+        return views, told(self.matcher, self.observer, self._memory, eyes(head, gaze))
 
     def truth(self, cells: Tensor) -> Truth:
         """What the judge knows as the robot stands now: the nearest point, and the surface behind each cell (Nx, 3)."""
@@ -158,12 +162,17 @@ class SimulatedArena:
 
 
 def look_together(arenas: Sequence[SimulatedArena], gaze: Gaze, generators: Sequence[torch.Generator]) -> Look:
-    """Looks of photometric arenas at B gazes, as `torchfovea.arena.Arenas` has them; drawn together, not recorded."""
-    gazes = [Gaze(*(angle[b] for angle in gaze)) for b in range(len(arenas))]
-    with compiling(arenas[0].observer.compile):
+    """Looks of one observer in photometric arenas at B gazes, as `torchfovea.arena.Arenas` has them; not recorded.
+
+    They are drawn together, and matched together by matchers that can (`torchfovea.stereo.matchers.match_all`).
+    """
+    first, gazes = arenas[0], [Gaze(*(angle[b] for angle in gaze)) for b in range(len(arenas))]
+    with compiling(first.observer.compile):
         images = images_together([a.world for a in arenas], [a._true(g) for a, g in zip(arenas, gazes, strict=True)])
-    looks = [
-        arena.match(left.image, right.image, own, generator)
-        for arena, (left, right), own, generator in zip(arenas, images, gazes, generators, strict=True)
-    ]
+        tasks = [
+            arena.task(left.image, right.image, own)
+            for arena, (left, right), own in zip(arenas, images, gazes, strict=True)
+        ]
+        views, matchers = zip(*tasks, strict=True)
+        looks = look_at_all(first.observer, views, matchers, generators, first.sample)
     return Look(stack([look.matches for look in looks]), [look.pictures for look in looks])

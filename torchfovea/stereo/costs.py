@@ -21,6 +21,7 @@ from torchfovea.stereo.views import Views
 
 __all__ = [
     "Eye",
+    "Hypotheses",
     "Looks",
     "correlate",
     "inverse_depths",
@@ -230,34 +231,51 @@ def correlate(
     return cov * (own.variance * variance).rsqrt(), seen
 
 
+class Hypotheses(NamedTuple):
+    """Inverse depths that are tried for B pairs of images, ascending; those past a pair's own number mean nothing.
+
+    Attributes:
+        rho: (B, D) [1/m].
+        number: int64 (B,), how many each pair has, at least 5 and at most D.
+    """
+
+    rho: Tensor
+    number: Tensor
+
+
 @torch.no_grad()
-def inverse_depths(eye: Eye, sheet: Sheet, low: float, high: float, per_width: float, most: int) -> Tensor:
+def inverse_depths(eye: Eye, sheet: Sheet, low: Tensor, high: Tensor, per_width: float, most: int) -> Hypotheses:
     """Hypotheses of inverse depth as dense as the two retinas can tell apart.
 
     Args:
         eye: whose sheet it is.
         sheet: its finest cell decides.
-        low: the second hypothesis [1/m].
-        high: the last but one, > low [1/m].
+        low: the second hypothesis of each pair, (B,) [1/m].
+        high: the last but one, > low, (B,) [1/m].
         per_width: hypotheses per RF width of motion in the other eye.
         most: at most so many.
 
-    Returns:
-        (D,), ascending, D ≥ 5; RFs widen away from the fixation of verged eyes, and hypotheses thin out.
+    RFs widen away from the fixation of verged eyes, and hypotheses thin out.
     """
-    knots = torch.linspace(low, high, 65, device=sheet.px.device, dtype=sheet.px.dtype)
+    part = torch.linspace(0, 1, 65, device=low.device, dtype=low.dtype)
+    knots = low[:, None] + (high - low)[:, None] * part
     stride = max(1, round(math.sqrt(sheet.width_px.numel() / 400)))
     place, own = sheet.px[::stride, ::stride], sheet.width_px[::stride, ::stride]
-    u, v, seen = project(eye, sheet_rays(eye, place), knots[None, :, None, None])
+    u, v, seen = project(eye, sheet_rays(eye, place), knots[..., None, None])
     seen &= eye.retina.inside(place)
     width = torch.maximum(eye.retina.width_px(columns(u, v)), own)
     motion = torch.hypot(u.diff(dim=1), v.diff(dim=1)) / torch.minimum(width[:, 1:], width[:, :-1])
-    rate = torch.where(seen[:, 1:] & seen[:, :-1], motion, torch.zeros_like(motion)).amax((0, 2, 3))
+    rate = torch.where(seen[:, 1:] & seen[:, :-1], motion, torch.zeros_like(motion)).amax((2, 3))
     # where nothing is seen, hypotheses only fill the gap
-    rate = rate.clamp(min=1e-3 * float(rate.max()) + 1e-6)
-    steps = torch.cat([torch.zeros_like(rate[:1]), rate.cumsum(0)]) * per_width
-    count = min(max(2, math.ceil(float(steps[-1]))), most - 3)
-    at = torch.linspace(0, 1, count + 1, device=steps.device, dtype=steps.dtype) * steps[-1]
-    k = torch.searchsorted(steps, at, right=True).clamp(1, len(steps) - 1)
-    rho = knots[k - 1] + (at - steps[k - 1]) / (steps[k] - steps[k - 1]) * (knots[k] - knots[k - 1])
-    return torch.cat([2 * rho[:1] - rho[1:2], rho, 2 * rho[-1:] - rho[-2:-1]])
+    rate = torch.maximum(rate, 1e-3 * rate.amax(1, keepdim=True) + 1e-6)
+    steps = torch.cat([torch.zeros_like(rate[:, :1]), rate.cumsum(1)], 1) * per_width
+    last = steps[:, -1:]
+    count = last.ceil().clamp(2, most - 3).long()
+    at = (torch.arange(int(count.max()) + 1, device=steps.device) / count).to(steps).clamp(max=1) * last
+    k = torch.searchsorted(steps, at, right=True).clamp(1, steps.shape[1] - 1)
+    before, after = (steps.gather(1, k + j) for j in (-1, 0))
+    start, end = (knots.gather(1, k + j) for j in (-1, 0))
+    rho = start + (at - before) / (after - before) * (end - start)
+    beyond = 2 * rho.gather(1, count) - rho.gather(1, count - 1)
+    rho = torch.cat([2 * rho[:, :1] - rho[:, 1:2], rho, rho[:, -1:]], 1)
+    return Hypotheses(rho.scatter(1, count + 2, beyond), count[:, 0] + 3)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import torch
 from torch import Tensor
 
 from torchfovea.sensing.correspondence import Budget, Correspondences, Disparity
@@ -14,9 +15,11 @@ from torchfovea.stereo.external import DisparityFunction, External, match_extern
 from torchfovea.stereo.matching import match_sgbm
 from torchfovea.stereo.sgbm import SGBM
 from torchfovea.stereo.sweep import Sweep, SweepRange, Volume, match_sweep
-from torchfovea.stereo.views import Views
+from torchfovea.stereo.views import Views, batched_views
 
-__all__ = ["Match", "Matcher", "Narrowed", "checked_matches"]
+__all__ = ["Match", "Matcher", "Narrowed", "checked_matches", "match_all"]
+
+TOGETHER = 64_000  # receptive fields that are matched at once, 2 to 3 kB each: more gain nothing
 
 
 @runtime_checkable
@@ -93,6 +96,50 @@ class Matcher(NamedTuple):
             return match_sweep(views, retina, params, budget, self.nearest_m, volume=self.volume)
         source = resolve_source(self.source, views.rectified)
         return match_external(source, views, retina, params, budget, self.nearest_m)
+
+
+def match_all(
+    matchers: Sequence[Match], views: Sequence[Views], retina: Retina, budget: Budget
+) -> list[tuple[Correspondences, Any]]:
+    """What matchers answer to a pair each; sweeps that differ in their volumes alone match together.
+
+    Args:
+        matchers: as many as there are pairs.
+        views: single pairs.
+        retina: of all.
+        budget: of all.
+    """
+    found: list[tuple[Correspondences, Any]] = []
+    most = max(1, TOGETHER // retina.count)
+    for start in range(0, len(views), most):
+        own, pairs = matchers[start : start + most], views[start : start + most]
+        together, batch = _as_one(own), batched_views(pairs)
+        if together is None or batch is None:
+            found += [match(pair, retina, budget) for match, pair in zip(own, pairs, strict=True)]
+        else:
+            matches, ranges = together(batch, retina, budget)
+            assert isinstance(ranges, SweepRange)
+            found += [(matches.take(b), ranges.take(b)) for b in range(len(pairs))]
+    return found
+
+
+def _as_one(matchers: Sequence[Match]) -> Matcher | None:
+    """Sweeps of some rows as one; None for one row, and for what matches single pairs only."""
+    first = matchers[0]
+    if len(matchers) == 1 or not isinstance(first, Matcher) or not isinstance(first.params, Sweep):
+        return None
+    plain = first._replace(volume=None)
+    volumes = []
+    for other in matchers:
+        if not isinstance(other, Matcher) or other._replace(volume=None) != plain:
+            return None
+        volumes.append(other.volume)
+    told = [volume for volume in volumes if volume is not None]
+    if not told:
+        return plain
+    if len(told) < len(matchers):
+        return None
+    return plain._replace(volume=Volume(*(torch.stack(bounds) for bounds in zip(*told, strict=True))))
 
 
 def checked_matches(answer: object, retina: Retina) -> tuple[Correspondences, Any]:

@@ -121,8 +121,8 @@ def match_sheet(eye: Eye, sheet: Sheet, params: Sweep, low: Tensor, high: Tensor
         eye: whose sheet it is.
         sheet: with n RFs.
         params: of the sweep.
-        low: (B, N), least inverse depth of every RF of the retina [1/m].
-        high: (B, N), greatest.
+        low: (B, N), least inverse depth of every RF of the retina [1/m], or (1, 1) for all.
+        high: greatest, likewise.
 
     Returns:
         The RFs (n,); their inverse depth, its variance, correlation, unit and misfit, (B, 5, n); and bool (B, n),
@@ -138,39 +138,53 @@ def match_sheet(eye: Eye, sheet: Sheet, params: Sweep, low: Tensor, high: Tensor
 @torch.no_grad()
 def win(eye: Eye, sheet: Sheet, params: Sweep, low: Tensor, high: Tensor) -> Winner:
     """The best hypotheses between bounds, see `match_sheet`."""
-    cell = nearest_rf(eye.retina, 1 / eye.scale, sheet.px)
-    low, high = low[:, cell][:, None], high[:, cell][:, None]
-    least, most = float(low.amin()), float(high.amax())
-    rho = inverse_depths(eye, sheet, least, max(most, least + 1e-6), params.per_width, params.hypotheses)[
-        None, :, None, None
-    ]
+    low, high = (_at_cells(eye, sheet, bound) for bound in (low, high))
+    least, most = low.amin((1, 2)).expand(len(eye.R)), high.amax((1, 2)).expand(len(eye.R))
+    most = torch.maximum(most, least + 1e-6)
+    rho, number = inverse_depths(eye, sheet, least, most, params.per_width, params.hypotheses)
     own, ray = own_values(eye, sheet, params.window, params.noise), sheet_rays(eye, sheet.px)
-    cost = ray.new_empty(len(ray), rho.numel(), *sheet.width_px.shape)
-    chunk = max(1, CHUNK // low.numel())
-    bounded = bool((low > least).any() or (high < most).any())
-    for k in range(0, rho.numel(), chunk):
-        some = rho[:, k : k + chunk]
+    cost = ray.new_empty(*rho.shape, *sheet.width_px.shape)
+    chunk = max(1, CHUNK // ray[..., 0].numel())
+    if bounded := low.shape[-1] > 1:
+        # the widest bound is none; those that lie between two hypotheses leave the nearer one
+        low = torch.where(low > least[:, None, None], low, -math.inf)[:, None]
+        high = torch.where(high < most[:, None, None], high, math.inf)[:, None]
+        gap = rho.diff(dim=1)[..., None, None] / 2
+        slack = torch.maximum(torch.cat([gap[:, :1], gap], 1), torch.cat([gap, gap[:, -1:]], 1))
+    for k in range(0, rho.shape[1], chunk):
+        some = rho[:, k : k + chunk, None, None]
         z, seen = correlate(eye, sheet, own, ray, some, params.window, params.noise)
         if bounded:
-            slack = (some - rho[:, max(k - 1, 0) : max(k - 1, 0) + some.shape[1]]).abs().amax()
-            seen = seen & (some >= low - slack) & (some <= high + slack)
+            reach = slack[:, k : k + chunk]
+            seen = seen & (some >= low - reach) & (some <= high + reach)
         cost[:, k : k + chunk] = torch.where(seen, 1 - z, torch.ones_like(z)).clamp_(max=1)
-    rho = rho.flatten()
+    last = number[:, None, None] - 1
+    place = torch.arange(rho.shape[1], device=rho.device)
+    if len(rho) > 1:  # what is past a pair's own hypotheses is none
+        cost.masked_fill_((place > last[:, 0])[..., None, None], math.inf)
     total = aggregate(cost, own.values[:, 0], sheet.closed, params.smooth_small, params.smooth_large, params.contrast)
     best = total.amin(0)
-    index = torch.arange(len(rho), device=rho.device, dtype=torch.int16)[:, None, None, None]
-    win = torch.where(total == best, index, len(rho)).amin(0).long()
-    inner = win.clamp(1, len(rho) - 2)
+    index = place.to(torch.int16)[:, None, None, None]
+    win = torch.where(total == best, index, len(total)).amin(0).long()
+    inner = torch.minimum(win.clamp(min=1), last - 1)
     before, here, after = (total.gather(0, (inner + k)[None])[0] for k in (-1, 0, 1))
     for k in range(-2, 3):  # what is left are other surfaces
-        total.scatter_(0, (win + k).clamp(0, len(rho) - 1)[None], math.inf)
+        total.scatter_(0, (win + k).clamp(0, len(total) - 1)[None], math.inf)
     clear = total.amin(0) - best >= params.uniqueness * best
-    win = inner
     bend = before - 2 * here + after
     part = torch.where(bend > 0, (before - after) / (2 * bend.clamp(min=1e-9)), torch.zeros_like(bend))
     part = (4 * part.clamp(-0.5, 0.5)).round() / 4
-    step = torch.where(part < 0, rho[win] - rho[win - 1], rho[win + 1] - rho[win])
-    return Winner(rho[win] + part * step, step, clear)
+    first, middle, third = (rho.gather(1, (inner + k).flatten(1)).view_as(best) for k in (-1, 0, 1))
+    step = torch.where(part < 0, middle - first, third - middle)
+    return Winner(middle + part * step, step, clear)
+
+
+def _at_cells(eye: Eye, sheet: Sheet, bound: Tensor) -> Tensor:
+    """A bound of every RF (B, N) at a sheet's cells, (B, R, S); one that is the same everywhere (1, 1) as (1, 1, 1)."""
+    if bound.shape[-1] == 1:
+        return bound[..., None]
+    cell = nearest_rf(eye.retina, 1 / eye.scale, sheet.px)
+    return bound.index_select(1, cell.flatten()).view(-1, *cell.shape)
 
 
 def refine(eye: Eye, sheet: Sheet, winner: Winner, params: Sweep) -> Estimate:

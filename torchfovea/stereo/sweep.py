@@ -54,6 +54,11 @@ class SweepRange(NamedTuple):
     valid: Tensor
     clues: Clues
 
+    def take(self, index: int | Tensor) -> SweepRange:
+        """Every part at an index of the first axis: one pair of a batch (B, N), or some receptive fields (N,)."""
+        inverse_range, sigma, correlation, valid = (part[index] for part in self[:4])
+        return SweepRange(inverse_range, sigma, correlation, valid, self.clues.take(index))
+
 
 class Volume(NamedTuple):
     """Where to look: a volume of interest, such as a memory gives (paper Sec. 8).
@@ -113,7 +118,7 @@ def match_sweep(
     left_px = retina.centers_px(pair.device, pair.dtype)
     ray = sheet_rays(eye, left_px)
     length = ray.detach().square().sum(-1).sqrt()
-    low, high = (length.new_full((batch, retina.count), bound) for bound in widest)
+    low, high = (length.new_full((1, 1), bound) for bound in widest)
     if volume is not None:
         low, high = (bound.clamp(*widest) for bound in _depths(volume, retina, length.expand(batch, -1)))
     parts = [
@@ -160,10 +165,10 @@ def match_sweep(
     inverse_range, sigma, correlation = (
         torch.where(valid, x, zero) for x in (rho / length, sigma / length, correlation)
     )
+    found = SweepRange(inverse_range, sigma, correlation, valid, clues)
     if views.left.dim() == 3:
-        found = SweepRange(inverse_range[0], sigma[0], correlation[0], valid[0], clues.take(0))
-        return matches.take(0), found
-    return matches, SweepRange(inverse_range, sigma, correlation, valid, clues)
+        return matches.take(0), found.take(0)
+    return matches, found
 
 
 def _depths(volume: Volume, retina: Retina, length: Tensor) -> tuple[Tensor, Tensor]:

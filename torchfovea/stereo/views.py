@@ -7,6 +7,7 @@ retina spans the images' shorter side about the gaze, so that `Views.cameras` kn
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -20,7 +21,7 @@ from torchfovea.sensing.retina import Retina, fovea
 from torchfovea.setting import require
 from torchfovea.stereo.rig import StereoRig
 
-__all__ = ["Views", "grey_of", "posed_views", "rectified_views", "verged_views"]
+__all__ = ["Views", "batched_views", "grey_of", "posed_views", "rectified_views", "verged_views"]
 
 
 class Views(NamedTuple):
@@ -230,6 +231,18 @@ def posed_views(
         gazes.append((float(u), float(v)))
     other = None if gaze_right_px is None or gazes[0] == gazes[1] else gazes[1]
     return Views(*images, camera_left, camera_right, rig, gazes[0], gaze_right_px=other)
+
+
+def batched_views(views: Sequence[Views]) -> Views | None:
+    """Single pairs as one batch; None where they differ in more than their pictures and how the cameras are turned."""
+    first = views[0]
+    shapes = [(v.left.shape, v.right.shape, v.left.dtype, v.left.device, v.rig.baseline_m) for v in views]
+    rest = [v._replace(left=first.left, right=first.right, rig=first.rig) for v in views]
+    if any(shape != shapes[0] for shape in shapes) or any(other != first for other in rest):
+        return None
+    R_left, R_right = torch.stack([v.rig.R_left for v in views]), torch.stack([v.rig.R_right for v in views])
+    left, right = torch.stack([v.left for v in views]), torch.stack([v.right for v in views])
+    return first._replace(left=left, right=right, rig=StereoRig(R_left, R_right, first.rig.baseline_m))
 
 
 def _images(left: Tensor | np.ndarray, right: Tensor | np.ndarray) -> tuple[Tensor, Tensor]:
