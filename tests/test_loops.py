@@ -16,18 +16,10 @@ from torchfovea.memory.association import associate
 from torchfovea.memory.nearest import build_index, neighbour_spacing_rad
 from torchfovea.memory.sphere import fibonacci_directions, latitude_longitude_directions
 from torchfovea.sensing.correspondence import Budget
-from torchfovea.sensing.head import Gaze
 from torchfovea.sensing.retina import fovea, reconstruct
 from torchfovea.sensing.triangulation import Observations, observe
 from torchfovea.sensing.unscented import SigmaPoints
 from torchfovea.setting import SettingError
-from torchfovea.sim.arena import SimulatedArena
-from torchfovea.sim.cans import Cans
-from torchfovea.sim.scene import build_scene
-from torchfovea.sim.volume import PeriodicVolume
-from torchfovea.sim.world import World
-from torchfovea.stereo.matchers import Matcher
-from torchfovea.stereo.sgbm import SGBM
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 CLOSE = {torch.float32: {"rtol": 2e-4, "atol": 2e-5}, torch.float64: {"rtol": 1e-9, "atol": 1e-12}}
@@ -239,34 +231,3 @@ def test_loops_look_as_the_definition(gazes, size, dtype):
     same(*both(lambda: fovea(image, gaze, LogPolar(900), scale=max(size) / 200)), dtype)
     values = torch.rand(2, 3, LogPolar(900).count, generator=generator, dtype=torch.float64).to(dtype)
     same(*both(lambda: reconstruct(values, LogPolar(900), size)), dtype)
-
-
-@pytest.mark.parametrize("count", [3, 4])
-def test_a_loop_looks_up_a_volume_as_the_definition(count, generator):
-    values = torch.randn(4, 7, 7, 7, generator=generator)
-    # many periods, on voxels and on seams
-    places = 3 * torch.randn(3, 40, 5, generator=generator)
-    places[:, :10] = (7 * places[:, :10]).round() / 7
-    places[:, 10:12] = places[:, 10:12].round()
-    volume = PeriodicVolume(values.numpy(), torch.device("cpu"))
-    found = both(lambda: torch.stack(volume.at(places, count)))
-    # at a seam rounding may put a place into either period: the values there are the same
-    torch.testing.assert_close(*found, rtol=0, atol=2e-4)
-    assert found[0].shape == (count, 40, 5)
-
-
-def test_a_photometric_look_by_loops():
-    """A picture within what tests/test_drawing.py allows, and all but a few matches within a hundredth of a field."""
-    world = World(build_scene(Cans(), 5), camera=CAMERA, source_px=96)
-    gaze = Gaze(*(torch.tensor(a, dtype=torch.float64) for a in (0.2, 0.3, 0.1)))
-    looks = []
-    for mode in ("off", "on"):
-        observer = Observer(camera=CAMERA, retina=LogPolar(3000), compile=mode)
-        arena = SimulatedArena(world, observer, Matcher(SGBM()))
-        looks.append(arena.look(gaze, torch.Generator().manual_seed(0)))
-    one, other = looks
-    assert (one.pictures.left - other.pictures.left).abs().max() < 2e-3
-    assert (one.matches.valid == other.matches.valid).double().mean() > 0.995
-    both_valid = one.matches.valid & other.matches.valid
-    apart = (one.matches.right_px - other.matches.right_px).norm(dim=-1)[both_valid]
-    assert both_valid.double().mean() > 0.5 and apart.quantile(0.95) < 0.02

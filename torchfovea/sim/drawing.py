@@ -1,13 +1,7 @@
-"""Pictures of many scenes at once, as tensor operations on any device.
-
-A picture is cut into square tiles. A solid is tried only in the tiles whose cone of rays reaches into the azimuths and
-elevations that it spans, which every camera has; every ray leaves the room through the floor, a wall or the ceiling.
-Walls and shading are in single precision, which puts surfaces a few metres away within microns; the rest is in double.
-"""
+"""Pictures of many scenes at once, as tensor operations on any device."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
@@ -16,28 +10,14 @@ import torch
 from torch import Tensor
 
 from torchfovea.sensing.camera import Camera
-from torchfovea.sensing.chart import Components
-from torchfovea.setting import require
 from torchfovea.sim.model import Scene
-from torchfovea.sim.solids import (
-    Solids,
-    chord,
-    extent,
-    first,
-    outward,
-    solids_of,
-    way_out,
-)
+from torchfovea.sim.pixels import FACES, TILE, first_surfaces, pixels_of
+from torchfovea.sim.solids import Solids, solids_of
 from torchfovea.sim.texture import Paint, colour
 
 __all__ = ["Drawn", "Painted", "draw_pictures", "paint_scenes"]
 
-_TILE = 8  # side [px]
-_AREA = _TILE * _TILE
-_FACES = 6  # a room's, the first surfaces of each scene
-_MARGIN_RAD = 1e-4  # of cones and spans, for rounding
 _SKY = (0.62, 0.72, 0.82)
-_STEEPEST = 0.12  # cosine of the slant at which the footprint stops growing
 
 
 class Painted(NamedTuple):
@@ -68,24 +48,6 @@ class Drawn(NamedTuple):
     geom: Tensor
 
 
-class _Pixels(NamedTuple):
-    """What a camera's pixels see, tile by tile.
-
-    Attributes:
-        ray: unit, by component, float64 (3, T, 64).
-        single: the same in float32.
-        span: the angle that a pixel spans [rad], (T, 64).
-        axis: of the cone around a tile's rays, float64 (T, 3).
-        cone: half its angle [rad], float64 (T,).
-    """
-
-    ray: Tensor
-    single: Tensor
-    span: Tensor
-    axis: Tensor
-    cone: Tensor
-
-
 def paint_scenes(scenes: Sequence[Scene], device: torch.device | str = "cpu") -> Painted:
     """Scenes to draw, closed rooms or not."""
     solids = solids_of(scenes, device, closed=False)
@@ -95,162 +57,6 @@ def paint_scenes(scenes: Sequence[Scene], device: torch.device | str = "cpu") ->
         tables.append(Paint(*(part[..., own] for part in scene.paint)))
     paint = Paint(*(torch.cat(parts, -1).to(device) for parts in zip(*tables, strict=True)))
     return Painted(solids, geom.reshape(-1), paint)
-
-
-@lru_cache(maxsize=8)
-def _pixels(camera: Camera, size_px: int, device: torch.device) -> _Pixels:
-    side = -(-size_px // _TILE)
-    # past the edge, the edge's pixels again
-    index = torch.arange(side * _TILE, dtype=torch.float64).clamp(max=size_px - 1)
-    v, u = torch.meshgrid(index, index, indexing="ij")
-
-    def tiled(part: Tensor) -> Tensor:
-        return part.reshape(side, _TILE, side, _TILE).transpose(1, 2).reshape(-1, _AREA)
-
-    px = torch.stack([tiled(u), tiled(v)], -1)
-    ray = torch.nn.functional.normalize(camera.rays(px), dim=-1)
-    spans = []
-    for step in ((0.5, 0.0), (0.0, 0.5)):
-        shift = torch.tensor(step, dtype=torch.float64)
-        ends = [torch.nn.functional.normalize(camera.rays(px + s * shift), dim=-1) for s in (-1, 1)]
-        spans.append((ends[1] - ends[0]).norm(dim=-1))
-    axis = torch.nn.functional.normalize(ray.mean(1), dim=-1)
-    cone = 2 * torch.asin(((ray - axis[:, None]).norm(dim=-1).amax(1) / 2).clamp(max=1)) + _MARGIN_RAD
-    ray = ray.permute(2, 0, 1).contiguous()
-    parts = (ray, ray.float(), torch.maximum(*spans).float(), axis, cone)
-    return _Pixels(*(part.to(device) for part in parts))
-
-
-def _reached(solids: Solids, eye: Tensor, axis: Tensor, cone: Tensor) -> Tensor:
-    """Whether tiles may see solids, bool (K, B, T): of all shapes, one after the other.
-
-    Args:
-        solids: of the scenes.
-        eye: in the worlds, (B, 3).
-        axis: of the tiles' cones, (B, T, 3).
-        cone: half their angles [rad], (T,).
-    """
-    extents = [extent(shape, group.size[..., 0]) for shape, group in solids.groups]
-    radius, half = (torch.cat(parts, -1) for parts in zip(*extents, strict=True))
-    x, y, z = torch.cat([group.centre[..., 0] for _, group in solids.groups], -1) - eye.T[:, :, None]
-    away = torch.hypot(x, y)
-    # how far a solid and a tile reach to either side; all around where they are above, below or around
-    wide = torch.asin((radius / away).clamp(max=1)) + torch.where(away <= radius, math.pi, _MARGIN_RAD)
-    up = torch.asin(axis[..., 2].clamp(-1, 1))
-    side = torch.where(up.abs() + cone < math.pi / 2, cone.sin() / up.cos(), 2.0)
-    side = torch.where(side < 1, torch.asin(side.clamp(max=1)), math.pi)
-    near, far = (away - radius).clamp(min=0), away + radius
-    top, bottom = z + half, z - half
-    highest = torch.atan2(top, torch.where(top > 0, near, far)) + _MARGIN_RAD
-    lowest = torch.atan2(bottom, torch.where(bottom > 0, far, near)) - _MARGIN_RAD
-    # (K, B, 1) beside (B, T)
-    turn, wide, highest, lowest = (p.T.float()[..., None] for p in (torch.atan2(y, x), wide, highest, lowest))
-    turn = turn - torch.atan2(axis[..., 1], axis[..., 0]).float()
-    # an angle between directions, whichever way round
-    beside = math.pi - (turn.abs() - math.pi).abs() <= wide + side.float()
-    return beside & ((up - cone).float() <= highest) & ((up + cone).float() >= lowest)
-
-
-class _Met(NamedTuple):
-    """First surfaces on the rays of rows of pixels, (R, 64): range [m], and int32 which of the scene's they are."""
-
-    range_m: Tensor
-    surface: Tensor
-
-
-def _walls(solids: Solids, eye: Tensor, direction: Components) -> _Met:
-    """Where rays (B · T, 64) leave their room, each eye (B, 3) being inside."""
-    offset = solids.middle[..., 0] - eye.T
-    inside = bool(((solids.half[..., 0] - offset.abs()) > 0).all())
-    require(inside, "origin", "an eye outside of the room", "eyes inside")
-    rows = len(direction[0]) // len(eye)
-    out = [
-        way_out(o.repeat_interleave(rows)[:, None], h.repeat_interleave(rows)[:, None], d)
-        for o, h, d in zip(offset.float(), solids.half[..., 0].float(), direction, strict=True)
-    ]
-    best = torch.minimum(torch.minimum(out[0], out[1]), out[2])
-    face = (direction[2] > 0).int().add_(4)
-    for axis in (1, 0):  # arithmetic: torch.where is slow here
-        own = (direction[axis] > 0).int().add_(2 * axis)
-        face.add_((out[axis] <= best).int().mul_(own.sub_(face)))
-    return _Met(best, face)
-
-
-def _stand_before(met: _Met, solids: Solids, eye: Tensor, rotation: Tensor, pixels: _Pixels, near: Tensor) -> None:
-    """Put what stands in the rooms before their walls, in place.
-
-    Args:
-        met: the walls, (B · T, 64).
-        solids: of the scenes.
-        eye: in the worlds, float64 (B, 3).
-        rotation: of the cameras, float64 (B, 3, 3).
-        pixels: what they see.
-        near: see `_reached`.
-    """
-    which, batch, tile = near.nonzero().unbind(1)
-    row = batch * near.shape[2] + tile
-    counts = [group.geom.shape[1] for _, group in solids.groups]
-    parts = [part.count_nonzero() for part in near.split(counts)]
-    ends = torch.stack(parts).tolist()
-    found, place = [], 0
-    for (shape, group), number, b, t, count in zip(
-        solids.groups, which.split(ends), batch.split(ends), tile.split(ends), counts, strict=True
-    ):
-        own = b * count + number - place
-        # in double precision: a ray that grazes a cylinder magnifies rounding a thousandfold
-        x, y, z = (part.index_select(0, t) for part in pixels.ray)
-        dx, dy, dz = ((x * a).addcmul_(y, b).addcmul_(z, c) for a, b, c in rotation[b].permute(1, 2, 0)[..., None])
-        rx, ry, rz = (part.reshape(-1)[own, None] for part in group.centre[..., 0] - eye.T[:, :, None])
-        (sx, sy, sz), (c, s) = (part.flatten(1)[:, own, None].unbind(0) for part in (group.size, group.turn))
-        found.append(first(*chord(shape, (rx, ry, rz), (sx, sy, sz), (c, s), (dx, dy, dz))).float())
-        place += count
-    range_m, which = torch.cat(found), which.int().add_(_FACES)
-    # the first solids of all tiles, the second ones, ...: no tile comes twice at once
-    layer = near.cumsum(0)[near] - 1
-    for pairs in layer.argsort(stable=True).split(layer.bincount().tolist()):
-        rows, here = row[pairs], range_m.index_select(0, pairs)
-        before, surface = met.range_m.index_select(0, rows), met.surface.index_select(0, rows)
-        surface.add_((here < before).int().mul_(which[pairs, None] - surface))
-        met.surface.index_copy_(0, rows, surface)
-        met.range_m.index_copy_(0, rows, torch.minimum(here, before))
-
-
-def _normals(met: _Met, solids: Solids, eye: Tensor, direction: Components, near: Tensor) -> list[Tensor]:
-    """Of the first surfaces, by component (B · T, 64): into the room, or out of what stands in it.
-
-    Args:
-        met: the first surfaces.
-        solids: of the scenes.
-        eye: in the worlds, (B, 3).
-        direction: of the rays, (B · T, 64).
-        near: see `_reached`.
-    """
-    inward = torch.zeros(3, _FACES + len(near)).to(met.range_m)
-    for axis in range(3):
-        inward[axis, 2 * axis], inward[axis, 2 * axis + 1] = 1, -1
-    which = met.surface.view(-1)
-    normal = [part.index_select(0, which).view_as(met.range_m) for part in inward]
-    place = _FACES
-    for shape, group in solids.groups:
-        count, tiles = group.geom.shape[1], near.shape[2]
-        rows = near[place - _FACES :][:count].any(0).view(-1).nonzero()[:, 0]
-        if len(rows) > 0:
-            number = met.surface.index_select(0, rows).sub_(place)
-            mine = (number >= 0) & (number < count)
-            own = number.clamp_(0, count - 1).add_((rows // tiles * count).int()[:, None]).view(-1)
-            offset = group.centre[..., 0] - eye.T[:, :, None]
-            # of each pixel, what its solid is like
-            px, py, pz, sx, sy, sz, c, s = (
-                table.float().reshape(-1).index_select(0, own).view_as(mine)
-                for table in (*offset, *group.size, *group.turn)
-            )
-            away = met.range_m.index_select(0, rows)
-            dx, dy, dz = (d.index_select(0, rows).mul_(away) for d in direction)
-            out = outward(shape, (dx - px, dy - py, dz - pz), (sx, sy, sz), (c, s))
-            for part, found in zip(normal, out, strict=True):
-                part.index_copy_(0, rows, torch.where(mine, found, part.index_select(0, rows)))
-        place += count
-    return normal
 
 
 @torch.no_grad()
@@ -268,36 +74,32 @@ def draw_pictures(scenes: Painted, rotation: Tensor, eye: Tensor, camera: Camera
         SettingError: for an eye outside of its room.
     """
     solids, device = scenes.solids, scenes.geom.device
-    pixels = _pixels(camera, size_px, device)
-    count, tiles = len(eye), len(pixels.axis)
     rotation, eye = rotation.to(device, torch.float64), eye.to(device, torch.float64)
-    turned = rotation.float().transpose(0, 1).reshape(-1, 3) @ pixels.single.view(3, -1)
-    dx, dy, dz = turned.view(3, count * tiles, _AREA)
-    direction = (dx, dy, dz)
-    axis = pixels.axis @ rotation.mT
-    met = _walls(solids, eye, direction)
-    near = _reached(solids, eye, axis, pixels.cone)
-    _stand_before(met, solids, eye, rotation, pixels, near)
-    nx, ny, nz = _normals(met, solids, eye, direction, near)
-    slant = (dx * nx).addcmul_(dy, ny).addcmul_(dz, nz).abs_().clamp_(min=_STEEPEST)
-    span = pixels.span.repeat(count, 1) if count > 1 else pixels.span
-    at = eye.float().repeat_interleave(tiles, 0)
-    x, y, z = (torch.addcmul(at[:, k, None], d, met.range_m) for k, d in enumerate(direction))
+    count = len(eye)
+    range_m, surface, place, normal, footprint_m = first_surfaces(
+        solids, eye, rotation, pixels_of(camera, size_px, device)
+    )
     if count > 1:
         own = torch.arange(count, device=device, dtype=torch.int32) * (len(scenes.geom) // count)
-        met.surface.add_(own.repeat_interleave(tiles)[:, None])
-    rgb = colour(scenes.paint, met.surface, (x, y, z), (nx, ny, nz), met.range_m * span / slant)
-    geom = scenes.geom.index_select(0, met.surface.view(-1)).view_as(met.surface)
-    if bool((scenes.geom[:_FACES] < 0).any()):
+        surface.add_(own.repeat_interleave(len(surface) // count)[:, None])
+    rgb = colour(scenes.paint, surface, place, normal, footprint_m)
+    geom = scenes.geom.index_select(0, surface.view(-1)).view_as(surface)
+    if bool((scenes.geom[:FACES] < 0).any()):
         missed = geom < 0
         rgb = torch.where(missed, rgb.new_tensor(_SKY)[:, None, None], rgb)
-        met.range_m.masked_fill_(missed, torch.inf)
-
-    side = -(-size_px // _TILE)
+        range_m.masked_fill_(missed, torch.inf)
 
     def whole(part: Tensor) -> Tensor:  # (..., B · T, 64) to (B, ..., H, W)
-        lead = part.shape[:-2]
-        part = part.view(*lead, count, side, side, _TILE, _TILE).transpose(-2, -3).movedim(-5, 0)
-        return part.reshape(count, *lead, side * _TILE, side * _TILE)[..., :size_px, :size_px].contiguous()
+        rows = _rows(count, part.shape[:-2].numel(), -(-size_px // TILE), device)
+        picture = part.view(-1, TILE).index_select(0, rows.view(-1)).view(*rows.shape[:-1], -1)
+        return picture[..., :size_px, :size_px].contiguous().view(count, *part.shape[:-2], size_px, size_px)
 
-    return Drawn(whole(rgb), whole(met.range_m), whole(geom))
+    return Drawn(whole(rgb), whole(range_m), whole(geom))
+
+
+@lru_cache(maxsize=16)
+def _rows(count: int, channels: int, side: int, device: torch.device) -> Tensor:
+    """Where the tiles' rows of channels of pictures are in pictures of so many tiles a side, (B, C, H, W / 8)."""
+    rows = torch.arange(channels * count * side * side * TILE, dtype=torch.int32, device=device)
+    rows = rows.view(channels, count, side, side, TILE).permute(1, 0, 2, 4, 3)
+    return rows.reshape(count, channels, side * TILE, side)

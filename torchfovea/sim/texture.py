@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchfovea.machine import Loops, loops
 from torchfovea.sensing.chart import Components
 from torchfovea.sim.volume import PeriodicVolume
 
@@ -181,6 +182,9 @@ def colour(paint: Paint, geom: Tensor, point: Components, normal: Components, fo
     Returns:
         (3, R, C) RGB in [0, 1].
     """
+    library = loops(*point, *normal, footprint_m, paint.look)
+    if library is not None:
+        return _by_loop(library, paint, geom, point, normal, footprint_m)
     which = geom.reshape(-1)
 
     def told(table: Tensor) -> Tensor:  # (G,) of each point
@@ -208,3 +212,27 @@ def colour(paint: Paint, geom: Tensor, point: Components, normal: Components, fo
     # the mean of exp(noise) shrinks as octaves fade; put it back, or far walls would darken
     gain = log_albedo.mul_(contrast).addcmul_(contrast.square_(), power, value=-0.5).exp_()
     return albedo.mul_(gain.mul_(_light(normal))).clamp_(0, 1)
+
+
+def _by_loop(
+    library: Loops, paint: Paint, geom: Tensor, point: Components, normal: Components, footprint_m: Tensor
+) -> Tensor:
+    """`colour` by the loop of texture.c."""
+    rgb = footprint_m.new_empty(3, *geom.shape)
+    repeat = paint.repeat_m if bool(paint.repeat_m.isfinite().any()) else None
+    tables = [part.contiguous() for part in (paint.look, paint.offset, paint.centre, paint.can, paint.stripes)]
+    scales, lights = _scales(), torch.tensor(_LIGHTS)
+    painted = (len(paint.repeat_m), *tables, repeat, len(scales), scales, len(lights), lights, _AMBIENT, _PIXEL_SIGMA)
+    points = (*geom.shape, *(part.contiguous() for part in (geom.int(), *point, *normal, footprint_m)))
+    library("paint", _volume(geom.device).flat, painted, points, rgb)
+    return rgb
+
+
+@lru_cache(maxsize=1)
+def _scales() -> Tensor:
+    """Of each scale the rotation to periods, how its coarsest octave fades, where, and its amplitudes, (3, 14)."""
+    rows = []
+    for scale, turn in enumerate(_turns()):
+        turn = turn.T / (_VOXELS_M[scale] * _SIZE)
+        rows.append((*turn.flat, _decay(scale), _widest(scale), *_AMPLITUDES[3 * scale : 3 * scale + 3]))
+    return torch.tensor(rows, dtype=torch.float32)

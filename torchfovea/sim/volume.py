@@ -1,8 +1,7 @@
 """Periodic volumes of numbers, looked up between their voxels.
 
 `torch.nn.functional.grid_sample` is the definition. On a CPU it goes voxel by voxel; OpenCV, where it is installed and
-does not round places to 1/32 of a voxel as it did before its version 5, is several times faster; a loop in C, where it
-is wanted (`torchfovea.machine.loops`), twice as fast as that.
+does not round places to 1/32 of a voxel as it did before its version 5, is several times faster.
 """
 
 from __future__ import annotations
@@ -13,8 +12,6 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-
-from torchfovea.machine import loops
 
 __all__ = ["PeriodicVolume"]
 
@@ -37,7 +34,8 @@ class PeriodicVolume:
         self.values = torch.from_numpy(closed)[None].to(device, memory_format=torch.channels_last_3d)
         # floors above each other, for OpenCV
         self._sheet = np.ascontiguousarray(closed.transpose(1, 2, 3, 0)).reshape(-1, self.size + 1, 4)
-        self._flat = torch.from_numpy(self._sheet)
+        # and for torchfovea/sim/texture.c
+        self.flat = (self.size, torch.from_numpy(self._sheet))
 
     def at(self, places: Tensor, count: int = 4) -> list[Tensor]:
         """The first numbers of each voxel, by linear interpolation.
@@ -49,12 +47,6 @@ class PeriodicVolume:
         Returns:
             So many tensors (R, C).
         """
-        library = loops(places, self._flat)
-        if library is not None:
-            seen = places.new_empty(count, *places.shape[1:])
-            volume = (self.size, self._flat)
-            library("read_volume", volume, places.contiguous(), places[0].numel(), count, seen)
-            return list(seen.unbind(0))
         within = places - places.floor()
         found = self._by_opencv if places.device.type == "cpu" and _exact() else self._by_torch
         return found(within, count)

@@ -15,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from torchfovea.commands.bench.timing import Path, Peer, same
 from torchfovea.commands.shared.build import build_arena, build_cells, build_scene_of, number, whole
 from torchfovea.commands.shared.rollout import roll_out
+from torchfovea.compiling import compiling
 from torchfovea.deciding.weighted import Weighting
 from torchfovea.perception import Observer, Step, compiled, decide, new_memory, perceive
 from torchfovea.sensing.camera import image_camera
@@ -44,13 +45,18 @@ def picture(cfg: DictConfig, observer: Observer, size: int) -> Path:
         if backend is not None:
             same("render", ours.range_m[hits], by_gl().range_m[hits], 0.02, 0.97)
 
+    def quick() -> object:
+        with compiling(cfg.compile):
+            return by_rays()
+
     shown = by_rays()
+    peers = () if backend is None else (Peer(f"OpenGL, {backend}", by_gl),)
     return Path(
         "render",
         f"a picture of {size} x {size} by rays",
         "cpu",
         by_rays,
-        () if backend is None else (Peer(f"OpenGL, {backend}", by_gl),),
+        peers if cfg.compile == "off" else (*peers, Peer("ours, compiled", quick)),
         check,
         sum(part.numel() * part.element_size() for part in shown),
     )
