@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchfovea.sensing.camera import Camera
 from torchfovea.sim.model import Scene
-from torchfovea.sim.pixels import FACES, TILE, first_surfaces, pixels_of
+from torchfovea.sim.pixels import FACES, TILE, pixels_of, surfaces_seen
 from torchfovea.sim.solids import Solids, solids_of
 from torchfovea.sim.texture import Paint, colour
 
@@ -76,7 +76,7 @@ def draw_pictures(scenes: Painted, rotation: Tensor, eye: Tensor, camera: Camera
     solids, device = scenes.solids, scenes.geom.device
     rotation, eye = rotation.to(device, torch.float64), eye.to(device, torch.float64)
     count = len(eye)
-    range_m, surface, place, normal, footprint_m = first_surfaces(
+    range_m, surface, place, normal, footprint_m = surfaces_seen(
         solids, eye, rotation, pixels_of(camera, size_px, device)
     )
     if count > 1:

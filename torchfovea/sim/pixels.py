@@ -20,7 +20,7 @@ from torchfovea.sensing.chart import Components
 from torchfovea.setting import require
 from torchfovea.sim.solids import Solids, chord, extent, first, outward, tiny, way_out
 
-__all__ = ["FACES", "TILE", "Pixels", "Surfaces", "first_surfaces", "pixels_of"]
+__all__ = ["FACES", "TILE", "Pixels", "Surfaces", "pixels_of", "surfaces_seen"]
 
 TILE = 8
 """A tile's side [px]."""
@@ -224,7 +224,7 @@ def _normals(met: _Met, solids: Solids, eye: Tensor, direction: Components, near
     return normal
 
 
-def first_surfaces(solids: Solids, eye: Tensor, rotation: Tensor, pixels: Pixels) -> Surfaces:
+def surfaces_seen(solids: Solids, eye: Tensor, rotation: Tensor, pixels: Pixels) -> Surfaces:
     """The first surfaces that cameras see, one in each scene. Not differentiable.
 
     Args:
@@ -257,7 +257,7 @@ def first_surfaces(solids: Solids, eye: Tensor, rotation: Tensor, pixels: Pixels
 
 
 def _by_loop(library: Loops, solids: Solids, eye: Tensor, rotation: Tensor, pixels: Pixels, near: Tensor) -> Surfaces:
-    """`first_surfaces` by the loop of trace.c."""
+    """`surfaces_seen` by the loop of trace.c."""
     rows, origin = len(eye) * len(pixels.axis), eye.T.contiguous()
     tables = (rotation, origin, solids.middle, solids.half, near)
     view = (len(eye), len(pixels.axis), pixels.ray, pixels.span, *(part.contiguous() for part in tables), _STEEPEST)

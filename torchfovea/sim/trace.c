@@ -1,5 +1,5 @@
 /* Where rays meet solids: `torchfovea.sim.trace.ranges` and `occluded` by the chords of `torchfovea.sim.solids.chord`, and
-what the pixels of `torchfovea.sim.pixels.first_surfaces` see, which are the definition, in C, several rays at once in the
+what the pixels of `torchfovea.sim.pixels.surfaces_seen` see, which are the definition, in C, several rays at once in the
 processor's wide registers. REAL is float or double; what pixels see is shaded in float. */
 
 #include <math.h>
