@@ -290,12 +290,6 @@ def test_ties_among_thousands_are_uniform():
     assert stats.chisquare(counts).pvalue > 1e-4
 
 
-def test_best_of():
-    mean = torch.tensor([[1.0, 5.0, 3.0], [1.0, 5.0, 3.0]])
-    among = torch.tensor([[True, False, True], [False, False, False]])
-    assert aq.best_of(mean, among).tolist() == [3.0, 1.0]
-
-
 def test_stop_rule_bounds_the_probability():
     mean, std = belief(300, 12)
     mean = 1.5 * mean

@@ -8,7 +8,6 @@ import torch
 import torchfovea as tf
 from torchfovea import metrics
 from torchfovea.deciding import reward
-from torchfovea.deciding.acquisition import best_of
 from torchfovea.gaussian import (
     Gaussian,
     Information,
@@ -319,11 +318,6 @@ def test_metrics_of_any_batch():
     hit[1, 2, 3] = True
     assert metrics.found(hit).tolist() == [[False] * 3, [False, False, True]]
     assert metrics.saccades_to_target(hit).tolist() == [[4] * 3, [4, 4, 3]]
-
-
-def test_one_row_alone_has_an_incumbent():
-    assert best_of(torch.tensor([3.0, 5, 7]), torch.tensor([True, True, False])).item() == 5
-    assert best_of(torch.tensor([3.0, 5, 7]), torch.tensor([False] * 3)).item() == 3
 
 
 def test_what_float32_could_not_invert_is_not_definite():

@@ -192,7 +192,6 @@ FUZZED = {
         metrics.nees(n.tensor(4), n.positive(4)), metrics.gaussian_nll(n.tensor(4), n.positive(4)),
     ),
     "reward": lambda n: (
-        reward.inverse_range_reward(n.tensor(4), n.positive(4)),
         reward.range_from_inverse_range(reward.RewardBelief(n.tensor(4), n.positive(4))),
         reward.inverse_range_from_range(reward.RewardBelief(n.tensor(4), n.positive(4))),
     ),

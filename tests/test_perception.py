@@ -17,10 +17,11 @@ from torchfovea.commands.shared.strategy import build_stop, build_strategy
 from torchfovea.deciding import acquisition, strategies
 from torchfovea.deciding.reward import nearest_to
 from torchfovea.deciding.strategies import View
+from torchfovea.deciding.worth import worth_of_cells
 from torchfovea.gaussian import Information
 from torchfovea.memory.egosphere import Fusion, Prior
 from torchfovea.memory.sphere import fibonacci_directions
-from torchfovea.perception import Eligibility, Observer, decide, gaze_at, new_memory, reward_of
+from torchfovea.perception import Eligibility, Observer, decide, gaze_at, new_memory
 from torchfovea.sensing.camera import Pinhole
 from torchfovea.sensing.correspondence import Budget
 from torchfovea.sensing.head import Gaze, Head, gaze_point
@@ -40,7 +41,7 @@ def view_of(rows: int = 2, count: int = 40, dtype=torch.float64, seed: int = 0) 
     return View(
         mean,
         std,
-        acquisition.best_of(mean, eligible),
+        torch.where(eligible, mean, mean.amin(-1, keepdim=True)).amax(-1),
         eligible,
         directions,
         directions[:, 0],
@@ -235,11 +236,11 @@ def test_a_function_of_points_is_a_reward_as_good_as_a_named_one(fusion):
     memory = known_memory(
         named, cells, 0.3 + torch.rand(60, generator=torch.Generator().manual_seed(0)).to(cells), (1.0, 0.0)
     )
-    for a, b in zip(reward_of(named, memory)[1], reward_of(own, memory)[1], strict=True):
+    for a, b in zip(*(worth_of_cells(memory, one.reward)[1] for one in (named, own)), strict=True):
         torch.testing.assert_close(a, b)
     point = torch.tensor([0.5, 0.3, -0.2], dtype=cells.dtype)
     near = dataclasses.replace(named, reward=nearest_to(point))
-    points, reward, _ = reward_of(near, memory)
+    points, reward, _ = worth_of_cells(memory, near.reward)
     torch.testing.assert_close(reward.mean[::2], -(points.mean - point).norm(dim=-1)[::2])
     assert int(decide(near, memory).cell) >= 0
 
@@ -247,7 +248,8 @@ def test_a_function_of_points_is_a_reward_as_good_as_a_named_one(fusion):
 def test_a_surface_is_worth_as_much_as_it_is_believed():
     cells, observer = fibonacci_directions(60), Observer()
     rho = torch.full((60,), 1.5, dtype=cells.dtype)
-    sure, doubtful = (reward_of(observer, known_memory(observer, cells, rho, v))[1] for v in ((3.0, 0.0), (0.3, 2.7)))
+    memories = (known_memory(observer, cells, rho, votes) for votes in ((3.0, 0.0), (0.3, 2.7)))
+    sure, doubtful = (worth_of_cells(memory, observer.reward)[1] for memory in memories)
     prior = observer.prior
     std = doubtful.std[0].item()
     torch.testing.assert_close(sure.mean[::2], rho[::2], rtol=1e-3, atol=0)

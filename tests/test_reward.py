@@ -88,13 +88,6 @@ def test_conversions_are_clamped():
             rw.inverse_range_from_range(near, bad)
 
 
-def test_inverse_range_reward_is_the_belief_itself():
-    variance = torch.tensor([4.0, 0.0], requires_grad=True)
-    belief = rw.inverse_range_reward(torch.tensor([1.0, -1.0]), variance)
-    assert belief.mean.tolist() == [1, -1] and belief.std.tolist() == [2, 0]
-    assert torch.autograd.grad(belief.std.sum(), variance)[0].tolist() == [0.25, 0.0]
-
-
 @dtypes
 @pytest.mark.parametrize("size", [0.0, 1e-30, 1e-15, 1e-8, 1e-3])
 @pytest.mark.parametrize("spread", [0.0, 1e-4, 1.0])

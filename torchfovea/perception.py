@@ -16,7 +16,7 @@ from torchfovea.deciding.acquisition import Generators, choose
 from torchfovea.deciding.eligibility import Eligibility
 from torchfovea.deciding.reward import RewardBelief
 from torchfovea.deciding.strategies import Strategy, View, evaluate, upper_confidence_bound
-from torchfovea.deciding.worth import appraise, worth_of_cells
+from torchfovea.deciding.worth import appraise
 from torchfovea.gaussian import Gaussian, columns
 from torchfovea.memory.classes import Classes, new_classes
 from torchfovea.memory.egosphere import Fusion, Memory, Prior, check_chart, empty_memory
@@ -45,7 +45,6 @@ __all__ = [
     "gaze_at",
     "new_memory",
     "perceive",
-    "reward_of",
 ]
 
 
@@ -221,15 +220,6 @@ def perceive(
     return after._replace(axis=axis)
 
 
-def reward_of(observer: Observer, memory: Memory) -> tuple[Gaussian, RewardBelief, Tensor]:
-    """What an observer's cells are worth to it, see `torchfovea.deciding.worth.worth_of_cells`."""
-    return worth_of_cells(memory, observer.reward, _sought(observer))
-
-
-def _sought(observer: Observer) -> int | None:
-    return None if observer.classes is None else observer.classes.sought
-
-
 @unrounded
 def decide(
     observer: Observer,
@@ -253,8 +243,9 @@ def decide(
         SettingError: for a memory of another chart or prior than the observer's.
     """
     check_owner(observer, memory)
+    sought = None if observer.classes is None else observer.classes.sought
     with compiling(observer.compile):
-        appraised = appraise(memory, observer.reward, _sought(observer), observer.head, observer.eligibility)
+        appraised = appraise(memory, observer.reward, sought, observer.head, observer.eligibility)
     points, reward, open_to_looks, target, eligible, incumbent = appraised
     zero = torch.zeros_like(incumbent)
     view = View(

@@ -23,7 +23,6 @@ from torchfovea.setting import require
 
 __all__ = [
     "Generators",
-    "best_of",
     "choose",
     "draw",
     "expected_improvement",
@@ -209,12 +208,6 @@ def _ratio(x: Tensor) -> Tensor:
     for n in range(_TERMS, 1, -1):
         ratio = 1 / (x + n * ratio)
     return ratio
-
-
-def best_of(mean: Tensor, among: Tensor) -> Tensor:
-    """The incumbent: the highest mean (..., N) among a mask (..., N), as (...); where it is empty, the row's lowest."""
-    lowest = mean.amin(-1)
-    return torch.where(among, mean, lowest[..., None]).amax(-1)
 
 
 def known_well_enough(mean: Tensor, std: Tensor, eligible: Tensor, tolerance: float, probability: float) -> Tensor:

@@ -21,7 +21,6 @@ from torchfovea.setting import require
 __all__ = [
     "RewardBelief",
     "inverse_range_from_range",
-    "inverse_range_reward",
     "nearest_to",
     "of_class",
     "range_from_inverse_range",
@@ -61,19 +60,6 @@ def range_reward(gaussian: Gaussian) -> RewardBelief:
     along = quadratic3(cov, mean / norm[..., None])
     everywhere = (cov[..., 0] + cov[..., 3] + cov[..., 5]) / 3
     return RewardBelief(-torch.where(defined, norm, 0.0), _root(torch.where(defined, along, everywhere)))
-
-
-def inverse_range_reward(mean: Tensor, variance: Tensor) -> RewardBelief:
-    """Nearness in inverse range, r = ρ, of a belief held in inverse range: the same numbers.
-
-    Args:
-        mean: ρ (...) [1/m]; negative beyond infinity.
-        variance: (...) [1/m²].
-
-    Returns:
-        Mean and std (...) [1/m]. Differentiable, with finite gradients at variance 0.
-    """
-    return RewardBelief(mean, _root(variance))
 
 
 def range_from_inverse_range(belief: RewardBelief, far_m: float = 1000.0) -> RewardBelief:

@@ -7,12 +7,10 @@ from typing import Any
 
 from torchfovea.sensing.head import Head
 
-__all__ = ["ACTUATORS", "CAMERAS", "JOINTS", "add_head"]
+__all__ = ["JOINTS", "add_head"]
 
 JOINTS = ("pan", "tilt", "left_eye", "right_eye")
 """Joint names; both eyes turn about the optical y (down), so that vergence = left − right."""
-ACTUATORS = tuple(f"{name}_servo" for name in JOINTS)
-CAMERAS = ("left_eye", "right_eye")
 
 # a servo's natural frequency [rad/s] and the inertia that its gear reflects to the joint [kg m²]
 _SERVO = {"pan": (20.0, 0.05), "tilt": (20.0, 0.05), "left_eye": (90.0, 2e-4), "right_eye": (90.0, 2e-4)}

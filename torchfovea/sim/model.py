@@ -109,15 +109,7 @@ class Scene:
     @property
     def target_geoms(self) -> frozenset[int]:
         """The geoms of the target."""
-        return frozenset(self._of(TARGET))
-
-    @property
-    def floor_geoms(self) -> frozenset[int]:
-        """The geoms of the floor."""
-        return frozenset(self._of(FLOOR))
-
-    def _of(self, kind: int) -> list[int]:
-        return [int(g) for g in (self.kind == kind).nonzero()[:, 0]]
+        return frozenset((self.kind == TARGET).nonzero()[:, 0].tolist())
 
     def is_kind(self, geom: Tensor, kind: int) -> Tensor:
         """Whether geoms (...), -1 for none, are of a kind; bool (...)."""

@@ -205,8 +205,7 @@ def _validate(problem: Problem, schedule: Schedule, state: State) -> None:
 def _signature(schedule: Schedule, problem: Problem) -> dict[str, Any]:
     observer, task = problem.task.observer, problem.task._asdict()
     del task["observer"]
-    # all of the observer but its strategy, a function, which a checkpoint cannot hold and the simulator has its own of
-    parts = {f.name: repr(getattr(observer, f.name)) for f in fields(observer) if f.name != "acquisition"}
+    parts = {f.name: repr(getattr(observer, f.name)) for f in fields(observer)}
     return {"schedule": asdict(schedule), "shape": repr(problem.shape), "cells": problem.cells,
             "distribution": asdict(problem.distribution), **task, **parts}  # fmt: skip
 
