@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
 from rich.table import Table
 
 from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.manifest import MANIFEST, read_result, unchanged
+from torchfovea.commands.shared.screen import say, wide_screen
 from torchfovea.files import write_csv, write_result
 from torchfovea.setting import SettingError, require
 
@@ -33,9 +33,9 @@ def run(cfg: DictConfig) -> float:
             rows.append({"run": name, **_overrides(folder), **_figures(folder)})
         except (SettingError, OSError) as error:
             corrupt.append(name)
-            _say(f"{name}: {error}")
+            say(f"collect: {name}: {error}")
     for name in unfinished:
-        _say(f"{name}: no result.json (unfinished or failed); start the sweep again to run it")
+        say(f"collect: {name}: no result.json (unfinished or failed); start the sweep again to run it")
     require(bool(rows), "dir", source, "a folder with at least one complete run")
     columns = list(dict.fromkeys(key for row in rows for key in row))
     folder = run_folder()
@@ -53,13 +53,8 @@ def _show(columns: list[str], rows: list[dict[str, Any]]) -> None:
     for row in rows:
         cells = (row.get(c) for c in (*words, *figures))
         table.add_row(*("-" if v is None else f"{v:.4g}" if isinstance(v, float) else str(v) for v in cells))
-    console = Console()
-    (console if console.is_terminal else Console(width=200)).print(table, markup=False)
+    wide_screen().print(table, markup=False)
     print(f"collect.csv: {len(rows)} runs, {len(columns)} columns")
-
-
-def _say(line: str) -> None:
-    Console(stderr=True).print(f"collect: {line}", highlight=False, markup=False, soft_wrap=True)
 
 
 def _overrides(folder: Path) -> dict[str, str]:

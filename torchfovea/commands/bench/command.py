@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
 from rich.table import Table
 
 from torchfovea.commands.bench.against import compare
@@ -18,6 +17,7 @@ from torchfovea.commands.bench.memory import peak_bytes
 from torchfovea.commands.bench.timing import Path, Timing, copy_bandwidth, interleaved, slope
 from torchfovea.commands.shared.build import choice, number, whole
 from torchfovea.commands.shared.config import run_folder
+from torchfovea.commands.shared.screen import wide_screen
 from torchfovea.files import write_csv, write_result
 from torchfovea.setting import require
 
@@ -29,7 +29,6 @@ _COLUMNS = (
     "peer_median_ms", "peer_low_ms", "peer_high_ms", "peer_cpu_ms", "ratio", "bytes", "over_copy", "peak_bytes",
     "slope_rfs", "slope_cells", "slope_batch",
 )  # fmt: skip
-_WIDTH = 170  # of the table in a file
 _GROWTH_SHARE = 0.4  # of a path's seconds
 
 
@@ -62,9 +61,7 @@ def _run(cfg: DictConfig) -> float | None:
     if cfg.against is not None:
         return compare(cfg, wanted, seconds)
     require(cfg.history is None, "history", cfg.history, "null, or against=COMMIT besides")
-    folder, console = run_folder(), Console()
-    if not console.is_terminal:
-        console = Console(width=_WIDTH)
+    folder, console = run_folder(), wide_screen(170)
     bandwidth = copy_bandwidth(seconds / 2, device)
     figures: dict[str, Any] = {
         "machine": torch.cuda.get_device_name() if device == "cuda" else platform.processor() or platform.machine(),
@@ -73,20 +70,8 @@ def _run(cfg: DictConfig) -> float | None:
         "copy_bandwidth_bytes_per_second": bandwidth,
     }
     figures |= {f"{name}.{key}": None for name in PATHS for key in ("median_ms", "cpu_ms", "peer_median_ms", "ratio")}
-    table = Table(
-        "path",
-        "work",
-        "ms",
-        "CPU",
-        "peer",
-        "its ms",
-        "ratio",
-        "x copy",
-        "peak MB",
-        "slopes",
-        box=None,
-        padding=(0, 2, 0, 0),
-    )
+    columns = ("path", "work", "ms", "CPU", "peer", "its ms", "ratio", "x copy", "peak MB", "slopes")
+    table = Table(*columns, box=None, padding=(0, 2, 0, 0))
     rows: list[list[Any]] = []
     done: set[str] = set()
     for builder in builders:

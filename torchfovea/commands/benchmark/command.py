@@ -28,7 +28,7 @@ from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.manifest import read_kept, write_kept
 from torchfovea.commands.shared.mistakes import describe
 from torchfovea.commands.shared.parallel import spread, workers_of
-from torchfovea.commands.shared.progress import progress_bar
+from torchfovea.commands.shared.screen import progress_bar
 from torchfovea.commands.shared.settings import choice, number
 from torchfovea.files import write_json, write_result
 from torchfovea.setting import SettingError, require

@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
 
-from torchfovea.commands.calibrate.report import bins, print_figures, regions_of, table
+from torchfovea.commands.calibrate.report import bins, print_judgements, regions_of, table
 from torchfovea.commands.calibrate.simulated import SceneTask, looks_at_scenes, viewed
 from torchfovea.commands.calibrate.truths import Truths, look_at_pair
 from torchfovea.commands.shared.budgets import build_budget, made_for, write_budget
@@ -21,6 +20,7 @@ from torchfovea.commands.shared.config import run_folder, sized
 from torchfovea.commands.shared.pairs import OWN, Pair, check_named, gaze_of, load_pair, named_pair
 from torchfovea.commands.shared.parallel import workers_of
 from torchfovea.commands.shared.rehearsal import rehearse
+from torchfovea.commands.shared.screen import say
 from torchfovea.commands.shared.unread import refuse_unread
 from torchfovea.files import write_csv, write_result
 from torchfovea.sensing.correspondence import Budget
@@ -131,7 +131,7 @@ def run(cfg: DictConfig) -> float:
         {kind: (s.judged, {m: sigma_of(s.judged, law) for m, law in models[kind].items()}) for kind, s in data.items()},
     )
     write_result(folder, figures)
-    print_figures(figures, {kind: list(laws) for kind, laws in models.items()})
+    print_judgements(figures, {kind: list(laws) for kind, laws in models.items()})
     _refuse(figures, data, models, after)
     _write(folder / "budget" / "fitted.yaml", after, cfg, data, angles)
     return float(figures["after.mixture_nll"])
@@ -180,7 +180,7 @@ def _agreement(matcher: Matcher, data: dict[str, Split]) -> float:
         tells, other = matcher.params.tells, TURNED.get(matcher.params.tells)
         turned = "" if other is None else f"; matcher.tells={other} turns it round"
         line = f"matcher.tells = {tells}: errors shrink where it claims that they grow (rank correlation {rank:.2f})"
-        Console(stderr=True).print(f"{line}: expected the opposite{turned}", highlight=False, soft_wrap=True)
+        say(f"{line}: expected the opposite{turned}")
     return rank
 
 

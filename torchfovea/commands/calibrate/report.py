@@ -15,7 +15,7 @@ from torchfovea.commands.shared.regions import REGIONS
 from torchfovea.sensing.correspondence import Budget
 from torchfovea.studies.calibration import Judged, inlier_of, judge, reliability, select, sigma_of
 
-__all__ = ["FIGURES", "bins", "print_figures", "regions_of", "table"]
+__all__ = ["FIGURES", "bins", "print_judgements", "regions_of", "table"]
 
 FIGURES = (
     "nees_mean", "coverage_50", "coverage_90", "coverage_95", "coverage_99", "nll", "outlier_share", "ause",
@@ -83,7 +83,7 @@ def table(
     return RELIABILITY_COLUMNS, rows
 
 
-def print_figures(figures: Mapping[str, Any], models: Mapping[str, list[str]]) -> None:
+def print_judgements(figures: Mapping[str, Any], models: Mapping[str, list[str]]) -> None:
     """The most telling figures by area on the screen, a row for each judgement; then the fitted numbers."""
     first = next(iter(models))
     grid = Table("by area", "", *(name.replace("_", " ") for name in SHOWN), box=None)

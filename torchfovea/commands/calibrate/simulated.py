@@ -18,7 +18,7 @@ from torchfovea.commands.shared.build import (
     build_sensor,
 )
 from torchfovea.commands.shared.parallel import spread, workers_of
-from torchfovea.commands.shared.progress import progress_bar
+from torchfovea.commands.shared.screen import progress_bar
 from torchfovea.sensing.correspondence import Budget
 from torchfovea.sensing.head import Gaze, fixate
 from torchfovea.setting import SettingError

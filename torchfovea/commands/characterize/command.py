@@ -9,15 +9,13 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
 from torchfovea.commands.characterize.honesty import CHUNK, plan_cases, plan_planes, propagate, realise, wholes
 from torchfovea.commands.shared.build import build_camera, build_matcher, construct, number, whole
 from torchfovea.commands.shared.config import run_folder, sized
 from torchfovea.commands.shared.manifest import complete, finished
-from torchfovea.commands.shared.progress import progress_bar
+from torchfovea.commands.shared.screen import print_figures, progress_bar
 from torchfovea.commands.shared.unread import refuse_unread
 from torchfovea.files import write_csv
 from torchfovea.sensing.correspondence import Budget
@@ -105,7 +103,7 @@ def run(cfg: DictConfig) -> float:
     _write_advantage(folder, distance, matched, advantage)
     _draw(folder, cfg, grids, layouts, printed["uniform"])
     complete(folder, figures)
-    _print(figures)
+    print_figures(figures)
     return float(figures["foveal_advantage_min_nats"] or 0.0)
 
 
@@ -257,10 +255,3 @@ def _draw(
     )
     draw_fig5(folder / "fig5.png", grids, sensor.baseline_m, title)
     draw_layouts(folder / "layouts.png", layouts, sensor.budget.sigma_over_width)
-
-
-def _print(figures: dict[str, Any]) -> None:
-    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
-    for name, value in figures.items():
-        table.add_row(name, "-" if value is None else str(value) if isinstance(value, bool) else f"{value:.4g}")
-    Console().print(table)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
 from rich.table import Table
 
 from torchfovea.commands.memory.honesty import plan_honesty, study_honesty
@@ -14,6 +13,7 @@ from torchfovea.commands.shared.build import build_arena, build_cells, build_obs
 from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.memories import loaded_memory, memory_path
 from torchfovea.commands.shared.rehearsal import rehearse
+from torchfovea.commands.shared.screen import print_figures, wide_screen
 from torchfovea.files import write_csv, write_result
 from torchfovea.memory.nearest import neighbour_spacing_rad
 from torchfovea.memory.store import save_memory
@@ -68,10 +68,7 @@ def run(cfg: DictConfig) -> float:
     title = f"memory {cfg.memory.name}: {len(cells)} cells, {near_it}"
     draw_memory(folder / "memory.png", cells, spacing, toward, title)
     write_result(folder, figures)
-    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
-    for name, value in figures.items():
-        table.add_row(name, "-" if value is None else f"{value:.4g}")
-    Console().print(table)
+    print_figures(figures)
     return float(figures["cells_near_target"] or 0)
 
 
@@ -88,9 +85,6 @@ def _study(cfg: DictConfig, name: str) -> float:
         table.add_column(column, justify="right")
     for row in rows.rows:
         table.add_row(*("-" if v is None else f"{v:.4g}" if isinstance(v, float) else str(v) for v in row[:shown]))
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=200)
-    console.print(table)
+    wide_screen().print(table)
     write_result(folder, rows.figures())
     return float(len(rows.rows))

@@ -9,8 +9,6 @@ from typing import Any, NamedTuple
 
 import torch
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
 from torchfovea.cloud import carried_colours, cloud_of, painted, unpainted, write_cloud
@@ -18,9 +16,9 @@ from torchfovea.commands.shared.build import build_cells, build_match, build_obs
 from torchfovea.commands.shared.cameras import OF_FILES, cameras_of_files
 from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.memories import loaded_memory, memory_path
-from torchfovea.commands.shared.progress import progress_bar
 from torchfovea.commands.shared.rehearsal import rehearse
 from torchfovea.commands.shared.rollout import sample_of
+from torchfovea.commands.shared.screen import print_figures, progress_bar, say
 from torchfovea.commands.shared.settings import construct, whole
 from torchfovea.commands.shared.strategy import build_strategy
 from torchfovea.commands.shared.unread import refuse_unread
@@ -87,7 +85,7 @@ def run(cfg: DictConfig) -> float | None:
 
     def pass_over(error: SettingError) -> None:
         passed.append(str(error))
-        Console(stderr=True).print(f"replay: passed over: {error}", highlight=False, markup=False, soft_wrap=True)
+        say(f"replay: passed over: {error}")
 
     robot = Playback(recording, observer, matcher, sample_of(cfg), pass_over if cfg.skip else None, ahead)
     glances = search(robot, observer, memory, len(recording), generator, strategy)
@@ -105,10 +103,7 @@ def run(cfg: DictConfig) -> float | None:
         draw_replay(folder / "replay.png", done.look, done.glance, done.colours, done.rows, observer.retina)
     figures = figures_of(done, len(passed), ahead)
     write_result(folder, figures)
-    grid = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
-    for name, value in figures.items():
-        grid.add_row(name, f"{value:.4g}" if isinstance(value, float) else str(value))
-    Console().print(grid)
+    print_figures(figures)
     if done.stopped is not None:
         raise done.stopped
     return float(figures["information"])

@@ -22,7 +22,7 @@ from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.manifest import complete, finished, read_kept, write_kept
 from torchfovea.commands.shared.mistakes import describe
 from torchfovea.commands.shared.parallel import spread
-from torchfovea.commands.shared.progress import progress_bar
+from torchfovea.commands.shared.screen import progress_bar
 from torchfovea.files import write_csv, write_json
 from torchfovea.setting import SettingError, require
 

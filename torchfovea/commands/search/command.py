@@ -10,8 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
-from rich.table import Table
 
 from torchfovea.commands.search.figure1 import draw_scene, sensors_of
 from torchfovea.commands.search.remembering import (
@@ -29,9 +27,9 @@ from torchfovea.commands.shared.figures import EPISODE_COLUMNS, episode_row
 from torchfovea.commands.shared.manifest import complete, finished
 from torchfovea.commands.shared.memories import memory_path
 from torchfovea.commands.shared.parallel import spread, workers_of
-from torchfovea.commands.shared.progress import progress_bar
 from torchfovea.commands.shared.rehearsal import rehearse
 from torchfovea.commands.shared.rollout import batched, device_of, kept_scene, one_episode, roll_out
+from torchfovea.commands.shared.screen import print_figures, progress_bar
 from torchfovea.commands.shared.settings import choice, whole
 from torchfovea.commands.shared.viewers import Show, check_viewer, viewers
 from torchfovea.episode import Each, Episode
@@ -101,7 +99,7 @@ def run(cfg: DictConfig) -> float:
         save_memory(saved, last.step.memory)
     summary = summarize(rows)
     complete(folder, summary)
-    _print(summary)
+    print_figures(summary)
     return float(summary["gap_per_saccade"])
 
 
@@ -241,10 +239,3 @@ def _draw(folder: Path, cfg: DictConfig, observer: Observer, episode: Episode, r
     if route is not None:
         seen = replace(seen, pose=route.pose(episode.looks - 1))
     draw_episode(folder / "episode.png", episode, observer.retina, title, seen)
-
-
-def _print(figures: dict[str, Any]) -> None:
-    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
-    for name, value in figures.items():
-        table.add_row(name, "-" if value is None else f"{value:.4g}")
-    Console().print(table)

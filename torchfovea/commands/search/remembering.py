@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import torch
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
 from torch import Tensor
 
 from torchfovea.commands.shared.memories import memory_path, mixture_settings, mixture_yaml
+from torchfovea.commands.shared.screen import say
 from torchfovea.commands.shared.settings import choice, number
 from torchfovea.episode import Episode
 from torchfovea.files import replacing
@@ -80,7 +80,7 @@ def refit(cfg: DictConfig, found: list[Best]) -> DirectionMixture | None:
         noted = Noted(torch.stack([best.direction for best in seen]), ranges, torch.zeros(len(seen), 2))
         return fit_mixture(nearest_share(noted).direction)
     except SettingError as error:
-        Console(stderr=True).print(f"{error}; the bias stays as it is", highlight=False, markup=False, soft_wrap=True)
+        say(f"{error}; the bias stays as it is")
         return None
 
 

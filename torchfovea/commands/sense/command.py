@@ -9,8 +9,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from omegaconf import DictConfig
-from rich.console import Console
-from rich.table import Table
 
 from torchfovea.cloud import COVARIANCE, write_ply
 from torchfovea.commands.sense.checks import examine, examine_map, health_of
@@ -21,6 +19,7 @@ from torchfovea.commands.shared.budgets import build_budget
 from torchfovea.commands.shared.build import build_match, build_sensor, choice, name_of
 from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.pairs import Pair, gaze_of, load_pair
+from torchfovea.commands.shared.screen import print_figures, say
 from torchfovea.commands.shared.unread import refuse_unread
 from torchfovea.files import replacing, write_result
 from torchfovea.sensing.correspondence import Budget, Disparity
@@ -58,7 +57,7 @@ def run(cfg: DictConfig) -> float | None:
     pair, told = pair._replace(disparity=found_out.disparity), found_out.warnings
     if free:
         views = met(views, match.nearest_m if isinstance(match, Matcher) else 0.3)
-        _say(_MET.format(*views.gazes_px[1]))
+        say("sense: " + _MET.format(*views.gazes_px[1]))
     views = views.whole() if whole else views
     budget = misaligned(budget, found_out.rows_px)
 
@@ -86,12 +85,9 @@ def run(cfg: DictConfig) -> float | None:
         alike = partial(match_and_sense, match, looked, printed)
         draw_pair(folder / "figure1.png", pair, both, lambda r, b: alike(r, misaligned(b, found_out.rows_px))[0])
     write_result(folder, {**figures, "gaze_right_px": right_px, "warnings": told})
-    grid = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
-    for name, value in figures.items():
-        grid.add_row(name, f"{value:.4g}")
-    Console().print(grid)
+    print_figures(figures)
     for line in told:
-        _say(line)
+        say(f"sense: {line}")
     return figures.get("median_error_m")
 
 
@@ -105,10 +101,6 @@ def _looking(cfg: DictConfig, pair: Pair) -> tuple[Views, bool]:
         return pair.views(gaze), False
     other = gaze_of(cfg, pair, "gaze_right_px")
     return pair.views(gaze, other), other is None and pair.rig is not None
-
-
-def _say(line: str) -> None:
-    Console(stderr=True, soft_wrap=True).print(f"sense: {line}", highlight=False, markup=False)
 
 
 def _beside_plain(

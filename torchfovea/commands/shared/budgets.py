@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
 
 from torchfovea.commands.shared.config import conf_dir
+from torchfovea.commands.shared.screen import say
 from torchfovea.commands.shared.settings import choice, construct, whole
 from torchfovea.files import replacing
 from torchfovea.sensing.correspondence import Budget
@@ -117,7 +117,7 @@ def _filled(cfg: DictConfig, node: dict[str, Any]) -> dict[str, Any]:
     geometric = OmegaConf.select(cfg, "fidelity") == "geometric" or "matcher" not in cfg
     path = Path(conf_dir()) / "budget" / "ours.yaml" if geometric else shipped(cfg)
     if path is None:
-        _say(
+        say(
             f"budget = auto: none comes along for {cfg.sensor.layout} and {cfg.matcher.name}, the uncalibrated one is "
             "used (torchfovea calibrate fits one)"
         )
@@ -140,8 +140,4 @@ def _compare(cfg: DictConfig, purpose: Any, pair: bool) -> None:
         if angles and not min(angles) - 5 <= cfg.sensor.fov_deg <= max(angles) + 5:
             other.append(f"sensor.fov_deg = {angles}")
     if other:
-        _say(f"the budget was fitted with {'; '.join(other)}")
-
-
-def _say(line: str) -> None:
-    Console(stderr=True).print(line, highlight=False, markup=False, soft_wrap=True)
+        say(f"the budget was fitted with {'; '.join(other)}")

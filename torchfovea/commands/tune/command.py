@@ -16,7 +16,7 @@ from rich.console import Console
 from torchfovea.commands.shared.build import build_observer, construct, name_of, number, whole
 from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.manifest import complete, finished
-from torchfovea.commands.shared.progress import progress_bar
+from torchfovea.commands.shared.screen import progress_bar
 from torchfovea.commands.shared.strategy import read_number
 from torchfovea.commands.shared.unread import refuse_unread
 from torchfovea.commands.tune.files import write_memory, write_scenes
