@@ -13,6 +13,7 @@ from scipy.stats import norm
 
 from torchfovea.commands.shared.build import build_observer
 from torchfovea.commands.shared.config import conf_dir
+from torchfovea.commands.shared.kinds import check_kinds
 from torchfovea.commands.shared.strategy import build_strategy
 from torchfovea.commands.tune.command import build_problem
 from torchfovea.deciding import acquisition, strategies
@@ -246,7 +247,9 @@ def test_the_policy_alone_is_tuned_and_the_bias_stays():
 def test_weights_are_settings_of_tune():
     def built(*overrides):
         with initialize_config_dir(conf_dir(), version_base="1.3"):
-            return build_problem(compose("tune", overrides=list(overrides)))
+            cfg = compose("tune", overrides=list(overrides))
+        check_kinds(cfg, "tune")
+        return build_problem(cfg)
 
     p = built("acquisition=weighted", "acquisition.improvement=0.5", "tune_weights=[by_time]", "saccade_cost=0.01")
     assert (p.shape.tuned, p.shape.weights.improvement, p.task.saccade_cost) == (("by_time",), 0.5, 0.01)

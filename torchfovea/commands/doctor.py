@@ -75,13 +75,10 @@ def run(cfg: DictConfig) -> None:
     Its ``ok`` says that the defaults, rays and SGBM, can run.
 
     Raises:
-        SettingError: for a time limit that is not positive, and a `save` that is neither true nor false.
+        SettingError: for a time limit that is not positive.
     """
     timeout_s = cfg.probe_timeout_s
-    known = isinstance(timeout_s, int | float) and not isinstance(timeout_s, bool)
-    require(known and timeout_s > 0, "probe_timeout_s", timeout_s, "a positive number")
-    require(timeout_s <= 1e6, "probe_timeout_s", timeout_s, "a positive number of seconds, at most 1e6")
-    require(isinstance(cfg.save, bool), "save", cfg.save, "true or false")
+    require(0 < timeout_s <= 1e6, "probe_timeout_s", timeout_s, "a positive number of seconds, at most 1e6")
     required = [name for name in REQUIRED if not version(name)]
     absent = [name for name, extra in EXTRAS.items() if not all(map(is_there, extra.packages))]
     rays, rays_error = _probe(RAYS, timeout_s)

@@ -109,7 +109,6 @@ def compare(cfg: DictConfig, wanted: Sequence[str], seconds: float) -> float | N
         SettingError: outside a checkout of git, for a commit that there is not, or one whose bench is another.
     """
     name, history = str(cfg.against), cfg.history
-    require(history is None or isinstance(history, str), "history", history, "a file's name")
     root = Path(torchfovea.__file__).resolve().parents[1]
     told = HydraConfig.get().overrides.task
     settings = [one for one in told if not one.lstrip("+~").startswith(_OWN)]

@@ -15,9 +15,9 @@ from torchfovea.commands.bench.against import compare
 from torchfovea.commands.bench.builders import PATHS, builders_of
 from torchfovea.commands.bench.memory import peak_bytes
 from torchfovea.commands.bench.timing import Path, Timing, copy_bandwidth, interleaved, slope
-from torchfovea.commands.shared.build import choice, number, whole
 from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.screen import wide_screen
+from torchfovea.commands.shared.settings import device_of, number, whole
 from torchfovea.files import write_csv, write_result
 from torchfovea.setting import require
 
@@ -50,8 +50,7 @@ def run(cfg: DictConfig) -> float | None:
 
 
 def _run(cfg: DictConfig) -> float | None:
-    device = choice(cfg, "device", ("cpu", "cuda"))
-    require(device == "cpu" or torch.cuda.is_available(), "device", device, "cpu, or cuda on a machine that has it")
+    device = device_of(cfg)
     profile = SECONDS[str(HydraConfig.get().runtime.choices["profile"])]
     seconds = profile if cfg.seconds is None else number(cfg, "seconds")
     wanted = PATHS if cfg.paths is None else cfg.paths if OmegaConf.is_list(cfg.paths) else (cfg.paths,)

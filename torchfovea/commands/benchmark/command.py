@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from torchfovea import __version__
 from torchfovea.commands.benchmark.entries import Entry, entries_of
@@ -29,7 +29,7 @@ from torchfovea.commands.shared.manifest import read_kept, write_kept
 from torchfovea.commands.shared.mistakes import describe
 from torchfovea.commands.shared.parallel import spread, workers_of
 from torchfovea.commands.shared.screen import progress_bar
-from torchfovea.commands.shared.settings import choice, number
+from torchfovea.commands.shared.settings import choice, number, words
 from torchfovea.files import write_json, write_result
 from torchfovea.setting import SettingError, require
 
@@ -56,10 +56,10 @@ def _records(cfg: DictConfig) -> tuple[list[dict[str, Any]], Path]:
     """The record of every entry, and the run's folder, to which they are written."""
     profile = choice(cfg, "size", tuple(SIZES))
     size, split = SIZES[profile], choice(cfg, "split", ("training", "validation", "test"))
-    tracks = list(cfg.tracks) if OmegaConf.is_list(cfg.tracks) else [cfg.tracks]
-    require(len(tracks) > 0 and set(tracks) <= set(TRACKS), "tracks", tracks, "some of " + ", ".join(TRACKS))
+    tracks = words(cfg, "tracks", TRACKS)
     limit_s, entries, workers = number(cfg, "limit_s"), entries_of(cfg, tracks), workers_of(cfg)
-    size = size._replace(families=_families(cfg, size))
+    if cfg.families is not None:
+        size = size._replace(families=tuple(words(cfg, "families", SIZES["paper"].families)))
     units = [unit for entry in entries for unit in _units(entry, size, split, limit_s)]
     marks = fingerprint(size.families)
     told = [_told(unit, marks) for unit in units]
@@ -72,15 +72,6 @@ def _records(cfg: DictConfig) -> tuple[list[dict[str, Any]], Path]:
         write_json(folder / "records" / f"{entry.track}.{_file_name(entry.name)}.json", record)
         records.append(record)
     return records, folder
-
-
-def _families(cfg: DictConfig, size: Size) -> tuple[str, ...]:
-    if cfg.families is None:
-        return size.families
-    given = list(cfg.families) if OmegaConf.is_list(cfg.families) else [cfg.families]
-    known = SIZES["paper"].families
-    require(len(given) > 0 and set(given) <= set(known), "families", given, "some of " + ", ".join(known))
-    return tuple(given)
 
 
 def _units(entry: Entry, size: Size, split: str, limit_s: float) -> list[Unit]:

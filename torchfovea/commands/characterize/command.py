@@ -8,14 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from torch import Tensor
 
-from torchfovea.commands.characterize.honesty import CHUNK, plan_cases, plan_planes, propagate, realise, wholes
+from torchfovea.commands.characterize.honesty import CHUNK, plan_cases, plan_planes, propagate, realise
 from torchfovea.commands.shared.build import build_camera, build_matcher, construct, number, whole
 from torchfovea.commands.shared.config import run_folder, sized
 from torchfovea.commands.shared.manifest import complete, finished
 from torchfovea.commands.shared.screen import print_figures, progress_bar
+from torchfovea.commands.shared.settings import wholes
 from torchfovea.commands.shared.unread import refuse_unread
 from torchfovea.files import write_csv
 from torchfovea.sensing.correspondence import Budget
@@ -54,13 +55,10 @@ def run(cfg: DictConfig) -> float:
     """Characterize both sensors; the smallest advantage of the foveal one is what a sweeper sees."""
     refuse_unread("budget.source", "budget.sigma_points", "budget.made_for")
     cfg = sized(cfg, QUICK, FULL)
-    for name in ("propagation.run", "realised.run"):
-        asked = OmegaConf.select(cfg, name)
-        require(isinstance(asked, bool), name, asked, "true or false")
     printed = _sensors(cfg)
     full = {name: _with(sensor, _budget(cfg, whole(cfg, "sensor.source_px", 16))) for name, sensor in printed.items()}
     distance, vergence = _axis(cfg, "distance", "_m"), torch.deg2rad(_axis(cfg, "vergence", "_deg"))
-    sources, matched = wholes(cfg, "advantage_source_px"), matched_vergence(printed["uniform"].baseline_m, distance)
+    sources, matched = wholes(cfg, "advantage_source_px", 16), matched_vergence(printed["uniform"].baseline_m, distance)
     tasks, every = plan_planes(cfg), whole(cfg, "every", 1)
     planned = plan_cases(cfg, full["log_polar"]) if cfg.propagation.run else None
     generator = torch.Generator().manual_seed(whole(cfg, "seed", 0))
@@ -131,8 +129,7 @@ def _axis(cfg: DictConfig, name: str, unit: str) -> Tensor:
     """A grid's distances or vergences, evenly spaced."""
     low, high, count = cfg[f"{name}_min{unit}"], cfg[f"{name}_max{unit}"], whole(cfg, f"{name}s", 2)
     for end, value in (("min", low), ("max", high)):
-        known = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-        require(known, f"{name}_{end}{unit}", value, "a number")
+        require(math.isfinite(value), f"{name}_{end}{unit}", value, "a number")
     if name == "distance":
         require(low > 0, f"distance_min{unit}", low, "more than 0: a plane in front of the eyes")
     else:

@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from torchfovea.commands.shared.build import build_matcher, whole
+from torchfovea.commands.shared.settings import numbers, wholes
 from torchfovea.files import write_csv
 from torchfovea.sensing.unscented import SigmaPoints
 from torchfovea.setting import require
@@ -36,12 +37,10 @@ from torchfovea.studies.realised import (
 __all__ = [
     "PROPAGATION_COLUMNS",
     "REALISED_COLUMNS",
-    "numbers",
     "plan_cases",
     "plan_planes",
     "propagate",
     "realise",
-    "wholes",
 ]
 
 SENSORS = ("log_polar", "uniform")
@@ -60,25 +59,9 @@ CHUNK = 1 << 14
 RING_SHARES = (0.0, 0.1, 0.2, 0.4, 0.7, 1.001)
 
 
-def numbers(cfg: DictConfig, setting: str) -> list[float]:
-    """A list of numbers, read at a dotted name."""
-    values = OmegaConf.select(cfg, setting)
-    listed = OmegaConf.is_list(values) and len(values) > 0
-    good = listed and all(isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in values)
-    require(good, setting, values, "a list of numbers")
-    return [float(v) for v in values]
-
-
-def wholes(cfg: DictConfig, setting: str) -> list[int]:
-    """A list of image sizes, read at a dotted name."""
-    values = numbers(cfg, setting)
-    require(all(v.is_integer() and v >= 16 for v in values), setting, values, "whole numbers, at least 16")
-    return [int(v) for v in values]
-
-
 def plan_planes(cfg: DictConfig) -> list[tuple[str, int, float]]:
     """Which planes to match: sensor, source_px, distance."""
-    sizes, distances = wholes(cfg, "realised.source_px"), numbers(cfg, "realised.distances_m")
+    sizes, distances = wholes(cfg, "realised.source_px", 16), numbers(cfg, "realised.distances_m")
     require(min(distances) > 0, "realised.distances_m", distances, "positive distances in metres")
     whole(cfg, "realised.planes")
     return [(name, size, d) for size in sizes for d in distances for name in SENSORS] if cfg.realised.run else []

@@ -15,11 +15,11 @@ from torchfovea.commands.shared.build import build_arena, build_cells, build_obs
 from torchfovea.commands.shared.config import conf_dir
 from torchfovea.commands.shared.judge import Judge, fixation_course, judge_cells
 from torchfovea.commands.shared.screen import progress_bar
+from torchfovea.commands.shared.settings import wholes, words
 from torchfovea.memory.egosphere import Memory, belief, trust
 from torchfovea.metrics import coverage, nees_mean, outlier_share
 from torchfovea.perception import Observer, new_memory, perceive
 from torchfovea.sensing.head import Gaze, eyes
-from torchfovea.setting import require
 from torchfovea.sim.arena import SimulatedArena
 from torchfovea.studies.significance import bootstrap_interval
 
@@ -84,19 +84,8 @@ def study_honesty(cfg: DictConfig, rows: Rows) -> None:
 
 def plan_honesty(cfg: DictConfig) -> tuple[list[str], list[int], list[int]]:
     """The sensors, numbers of cells and looks of the study's settings."""
-    sensors = OmegaConf.select(cfg, "honesty.sensors")
-    good = OmegaConf.is_list(sensors) and len(sensors) > 0 and all(s in SENSORS for s in sensors)
-    require(good, "honesty.sensors", sensors, "a list of " + ", ".join(SENSORS))
-    cells, looks = (_wholes(cfg, setting) for setting in ("honesty.cells", "honesty.looks"))
-    return [str(name) for name in sensors], cells, looks
-
-
-def _wholes(cfg: DictConfig, setting: str) -> list[int]:
-    values = OmegaConf.select(cfg, setting)
-    good = OmegaConf.is_list(values) and len(values) > 0
-    good = good and all(isinstance(v, int) and not isinstance(v, bool) and v >= 1 for v in values)
-    require(good, setting, values, "a list of whole numbers, at least 1")
-    return sorted(set(values))
+    cells, looks = (sorted(set(wholes(cfg, setting, 1))) for setting in ("honesty.cells", "honesty.looks"))
+    return words(cfg, "honesty.sensors", SENSORS), cells, looks
 
 
 def _settings(cfg: DictConfig, sensor: str) -> DictConfig:

@@ -68,8 +68,6 @@ def run(cfg: DictConfig) -> float | None:
     """Play a recording; the memory's mean information is what a sweeper sees."""
     refuse_unread("sensor.fov_deg", "sensor.camera", "sensor.source_px")
     recording = open_recording(cfg)
-    require(isinstance(cfg.skip, bool), "skip", cfg.skip, "true or false")
-    require(isinstance(cfg.picture, bool), "picture", cfg.picture, "true or false")
     watched = check_viewer(cfg)
     cfg = told_by(cfg, recording.calibration)
     observer = observer_of(build_observer(cfg), recording.calibration)
@@ -111,10 +109,9 @@ def run(cfg: DictConfig) -> float | None:
 
 def open_recording(cfg: DictConfig) -> Recording:
     """The recording of a configuration: a folder of its own form, or a bag."""
-    given = OmegaConf.select(cfg, "recording")
     expected = "a recording's folder (docs/recordings.md) or a ROS 2 bag"
-    require(isinstance(given, str), "recording", given, expected)
-    path = Path(str(given))
+    require(cfg.recording is not None, "recording", None, expected)
+    path = Path(cfg.recording)
     require(path.exists(), "recording", path, f"{expected}, but there is nothing")
     topics = construct(Topics, cfg.bag, "bag")
     if path.is_dir() and not (path / "metadata.yaml").exists():

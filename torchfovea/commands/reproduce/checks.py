@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
-import torch
 from omegaconf import DictConfig, OmegaConf
 
 from torchfovea.commands.reproduce.cells import METRICS, CellTask, cells_of, in_family
@@ -13,7 +13,7 @@ from torchfovea.commands.shared.build import build_observer
 from torchfovea.commands.shared.composed import compose_search, options
 from torchfovea.commands.shared.parallel import workers_of
 from torchfovea.commands.shared.rehearsal import rehearse
-from torchfovea.commands.shared.settings import choice, is_number, number, whole
+from torchfovea.commands.shared.settings import device_of, number, numbers, whole
 from torchfovea.setting import require
 
 __all__ = ["Plan", "checked"]
@@ -48,14 +48,13 @@ def checked(cfg: DictConfig) -> Plan:
     if sample is not None:
         sample = whole(cfg, "sensor.sample", 16)
         require(sample <= fields, "sensor.sample", sample, f"at most sensor.receptive_fields = {fields}")
-    device = choice(cfg, "device", ("cpu", "cuda"))
-    require(device == "cpu" or torch.cuda.is_available(), "device", device, "cpu, or cuda on a machine that has it")
-    require(is_number(cfg.level) and 0 < cfg.level < 1, "level", cfg.level, "a probability between 0 and 1")
+    device_of(cfg)
+    require(0 < cfg.level < 1, "level", cfg.level, "a probability between 0 and 1")
     whole(cfg, "fig5.vergences", 2), number(cfg, "fig5.peak_tolerance_rad"), number(cfg, "fig5.uniform_share")
-    _numbers(cfg, "fig5.distances_m", 1e-3)
+    numbers(cfg, "fig5.distances_m", 1e-3)
     for setting in ("fig8.alphas.few", "fig8.alphas.paper", "fig8.alphas.all", "fig9.alphas"):
-        _numbers(cfg, setting, 0.0, infinite=True)
-    _numbers(cfg, "fig8.fov_deg", 1e-3)
+        numbers(cfg, setting, 0.0, math.inf)
+    numbers(cfg, "fig8.fov_deg", 1e-3)
     for setting, group in (
         ("fig8.sensors", "sensor"), ("fig8.others", "acquisition"), ("fig8.extra", "acquisition"),
         ("fig9.biases", "memory"),
@@ -91,9 +90,3 @@ def _condition(node: Any, setting: str) -> None:
     for group in ("scene", "reading"):
         known = options(group)
         require(node[group] in known, f"{setting}: {group}", node[group], "one of " + ", ".join(known))
-
-
-def _numbers(cfg: DictConfig, setting: str, least: float, infinite: bool = False) -> None:
-    values = OmegaConf.select(cfg, setting)
-    good = all(v >= least and (infinite or is_number(v)) for v in values)
-    require(good and len(values) > 0, setting, values, f"a list of numbers, at least {least:g}")

@@ -28,7 +28,7 @@ from torchfovea.commands.shared.manifest import complete, finished
 from torchfovea.commands.shared.memories import memory_path
 from torchfovea.commands.shared.parallel import spread, workers_of
 from torchfovea.commands.shared.rehearsal import rehearse
-from torchfovea.commands.shared.rollout import batched, device_of, kept_scene, one_episode, roll_out
+from torchfovea.commands.shared.rollout import batched, episodes_device, kept_scene, one_episode, roll_out
 from torchfovea.commands.shared.screen import print_figures, progress_bar
 from torchfovea.commands.shared.settings import choice, whole
 from torchfovea.commands.shared.viewers import Show, check_viewer, viewers
@@ -57,9 +57,7 @@ def run(cfg: DictConfig) -> float:
     choice(cfg, "fidelity", ("photometric", "geometric"))
     if not batched(cfg):
         check_readable(cfg, observer)
-    device_of(cfg), whole(cfg, "batch"), workers_of(cfg)
-    require(isinstance(cfg.picture, bool), "picture", cfg.picture, "true or false")
-    require(isinstance(cfg.record, bool), "record", cfg.record, "true or false")
+    episodes_device(cfg), whole(cfg, "batch"), workers_of(cfg)
     require(not (cfg.record and cfg.fidelity == "geometric"), "record", True, "images, fidelity=photometric")
     watched = check_viewer(cfg)
     alone = not watched or workers_of(cfg)[0] == 1

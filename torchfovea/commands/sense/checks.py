@@ -6,11 +6,9 @@ import importlib.util
 from typing import NamedTuple
 
 import torch
-from omegaconf import DictConfig
 from torch import Tensor
 
 from torchfovea.commands.shared.pairs import Pair
-from torchfovea.setting import require
 from torchfovea.stereo.health import (
     Fault,
     disparity_faults,
@@ -22,9 +20,7 @@ from torchfovea.stereo.health import (
 from torchfovea.stereo.sparse import SparseMatches, match_sparse
 from torchfovea.stereo.views import Views
 
-__all__ = ["Examined", "examine", "examine_map", "health_of"]
-
-LEVELS = ("error", "warn", "off")
+__all__ = ["Examined", "examine", "examine_map"]
 
 
 class Examined(NamedTuple):
@@ -41,13 +37,6 @@ class Examined(NamedTuple):
     matches: SparseMatches | None
     disparity: Tensor | None
     warnings: list[str]
-
-
-def health_of(cfg: DictConfig) -> str:
-    """The setting `health`: error, warn or off."""
-    given = "off" if cfg.health is False else cfg.health  # as YAML reads off
-    require(given in LEVELS, "health", given, f"one of {', '.join(LEVELS)}")
-    return str(given)
 
 
 def examine(pair: Pair, views: Views, health: str) -> Examined:

@@ -11,7 +11,7 @@ import torch
 from omegaconf import DictConfig
 
 from torchfovea.cloud import COVARIANCE, write_ply
-from torchfovea.commands.sense.checks import examine, examine_map, health_of
+from torchfovea.commands.sense.checks import examine, examine_map
 from torchfovea.commands.sense.figure1 import draw_pair, retinas_of
 from torchfovea.commands.sense.points import Sensed, match_and_sense
 from torchfovea.commands.sense.report import beside, image_seen, match_figures, read_at_fields
@@ -46,7 +46,7 @@ def run(cfg: DictConfig) -> float | None:
     refuse_unread("sensor.fov_deg", "sensor.camera", "sensor.sample")
     every = name_of(cfg, "sensor", "layout") == "every_pixel"
     retina = None if every else build_sensor(cfg)[1]  # the field of view is the images' own
-    match, pair, health = build_match(cfg), load_pair(cfg), health_of(cfg)
+    match, pair, health = build_match(cfg), load_pair(cfg), choice(cfg, "health", ("error", "warn", "off"))
     raw = retina is None and pair.rig is not None
     require(not raw, "sensor.layout", "every_pixel", "a retina (sensor=log_polar or uniform) for raw images")
     views, free = _looking(cfg, pair)

@@ -42,8 +42,6 @@ def cameras_of_files(cfg: DictConfig, size_px: tuple[int, int]) -> StereoCalibra
         SettingError: for all that `load_calibration` refuses.
     """
     names = [name for name in ("calibration", "calibration_right") if cfg[name] is not None]
-    for name in names:
-        require(isinstance(cfg[name], str), name, cfg[name], "a file's name")
     lens = None if cfg.calibration_lens is None else choice(cfg, "calibration_lens", LENSES)
     unit = cfg.calibration_unit_m
     if unit is not None:

@@ -20,7 +20,6 @@ __all__ = ["aimed", "loaded_memory", "memory_path", "mixture_settings", "mixture
 def memory_path(cfg: DictConfig, setting: str) -> str | None:
     """A file's name or None; of memory.save one that can be written."""
     path = OmegaConf.select(cfg, setting)
-    require(path is None or isinstance(path, str), setting, path, "a file's name, FILE.npz, or null")
     if path is not None and setting == "memory.save":
         check_memory_path(path, setting)
     return None if path is None else str(path)

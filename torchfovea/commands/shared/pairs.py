@@ -90,7 +90,7 @@ def load_pair(cfg: DictConfig) -> Pair:
     for name in ("left", "right"):
         if cfg[name] is None:
             raise SettingError(f"{name} = null: expected an image file (or pair=motorcycle)")
-    left, right, faults = _images(_file(cfg, "left"), _file(cfg, "right"))
+    left, right, faults = _images(Path(cfg.left), Path(cfg.right))
     height, width = left.shape[-2:]
     cameras = cameras_of(cfg, (width, height))
     raw = cfg.disparity is not None and not cameras.rectified
@@ -176,11 +176,6 @@ def _images(left: Path, right: Path, where: str = "") -> tuple[Tensor, Tensor, t
     require(size == found, f"{where}right", found, f"the left image's {size}")
     *images, faults = exposed(one, other)
     return images[0], images[1], tuple(faults)
-
-
-def _file(cfg: DictConfig, name: str) -> Path:
-    require(isinstance(cfg[name], str), name, cfg[name], "a file's name")
-    return Path(cfg[name])
 
 
 def _pair(left: Tensor, right: Tensor, cameras: StereoCalibration, truth: Tensor | None) -> Pair:

@@ -16,7 +16,6 @@ from torchfovea.gaussian import Gaussian
 from torchfovea.metrics import information
 from torchfovea.sensing.head import Eyes
 from torchfovea.sensing.layout import Retina
-from torchfovea.setting import require
 
 __all__ = ["CAMERA", "EGO", "Dots", "PlotFrame", "bearings_deg", "both_sensors", "headline", "measured"]
 
@@ -64,9 +63,8 @@ def both_sensors(cfg: DictConfig, retina: Retina | None) -> dict[str, DictConfig
         retina: that the configuration describes, whose number of receptive fields the other gets.
 
     Raises:
-        SettingError: for anything but true or false, and for a sensor that is neither.
+        SettingError: for a sensor that is neither.
     """
-    require(isinstance(cfg.figure1, bool), "figure1", cfg.figure1, "true or false")
     if not cfg.figure1:
         return {}
     need("matplotlib")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -12,7 +11,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from torchfovea.commands.shared.named import build_named, name_of
-from torchfovea.commands.shared.settings import construct
+from torchfovea.commands.shared.settings import construct, is_number
 from torchfovea.deciding import reward
 from torchfovea.memory.classes import Classes
 from torchfovea.setting import require
@@ -33,11 +32,9 @@ def nearest_to(point: Any) -> Callable[[Tensor], Tensor]:
     Raises:
         SettingError: for anything else.
     """
-    three = isinstance(point, list | tuple) and len(point) == 3
-    numbers = three and all(isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in point)
-    require(
-        numbers, "reward.point", point, "[x, y, z] in metres: ahead, to the left and up from the ego frame's origin"
-    )
+    three = isinstance(point, list | tuple) and len(point) == 3 and all(map(is_number, point))
+    expected = "[x, y, z] in metres: ahead, to the left and up from the ego frame's origin"
+    require(three, "reward.point", point, expected)
     where = torch.tensor([float(v) for v in point], dtype=torch.float64)
     return lambda x: reward.nearest_to(where.to(x))(x)
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchfovea.arena import Truth
 from torchfovea.commands.shared.build import build_arena, build_cells, build_motor, build_scene_of, name_of
 from torchfovea.commands.shared.memories import aimed, loaded_memory
-from torchfovea.commands.shared.settings import choice, number, whole
+from torchfovea.commands.shared.settings import device_of, number, whole
 from torchfovea.commands.shared.strategy import build_stop, build_strategy
 from torchfovea.deciding.strategies import Strategy
 from torchfovea.episode import Each, Episode, Rules, run_episode, run_episodes
@@ -28,7 +28,7 @@ from torchfovea.sim.arenas import GeometricArenas
 from torchfovea.sim.model import Scene
 from torchfovea.sim.truth import truth_of
 
-__all__ = ["batched", "kept_scene", "one_episode", "prepare_episode", "roll_out", "sample_of"]
+__all__ = ["batched", "episodes_device", "kept_scene", "one_episode", "prepare_episode", "roll_out", "sample_of"]
 
 StrategyFor = Callable[[Sequence[Truth]], Strategy]
 
@@ -39,14 +39,13 @@ def batched(cfg: DictConfig) -> bool:
     return bool(cfg.fidelity == "geometric" and name_of(cfg, "motor") == "instant" and still)
 
 
-def device_of(cfg: DictConfig) -> str:
-    """Where episodes are computed; what cannot run there is refused.
+def episodes_device(cfg: DictConfig) -> str:
+    """Where episodes are computed.
 
     Raises:
-        SettingError: for another word, a machine without the device, and episodes that run on the CPU alone.
+        SettingError: for a device that there is none of here, and episodes that run on the CPU alone.
     """
-    device = choice(cfg, "device", ("cpu", "cuda"))
-    require(device == "cpu" or torch.cuda.is_available(), "device", device, "cpu, or cuda on a machine that has it")
+    device = device_of(cfg)
     require(device == "cpu" or batched(cfg), "device", device, "cpu, or fidelity=geometric motor=instant motion=still")
     return device
 
@@ -164,7 +163,7 @@ def roll_out(
     """
     parts = [prepare_episode(cfg, observer, seed) for seed in seeds]
     scenes, memories, truths, generators = (list(part) for part in zip(*parts, strict=True))
-    device = device_of(cfg) if "device" in cfg else "cpu"
+    device = episodes_device(cfg) if "device" in cfg else "cpu"
     memory = _to(stack(memories), device)
     if strategy is None:
         aims = stack([_aim(truth, number(cfg, "near_target_m")) for truth in truths]).to(device)

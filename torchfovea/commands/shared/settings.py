@@ -1,16 +1,25 @@
-"""Single settings of a composed configuration, each checked under the name the user knows."""
+"""Single settings of a composed configuration, each checked under the name the user knows.
+
+Whether they are numbers, words or lists of such has been checked before (`torchfovea.commands.shared.kinds`).
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+import sys
+from collections.abc import Collection
 from typing import Any, TypeVar
 
+import torch
 from omegaconf import DictConfig, OmegaConf
 
 from torchfovea.setting import require, typed
 
-__all__ = ["choice", "construct", "is_number", "is_whole", "number", "whole", "within"]
+__all__ = [
+    "choice", "construct", "device_of", "is_number", "is_whole", "number", "numbers", "whole", "wholes", "within",
+    "words",
+]  # fmt: skip
 
 T = TypeVar("T")
 
@@ -36,11 +45,26 @@ def construct(kind: type[T], node: DictConfig | dict[str, Any], where: str) -> T
     return kind(**values)
 
 
-def choice(cfg: DictConfig, setting: str, options: tuple[str, ...]) -> str:
+def choice(cfg: DictConfig, setting: str, options: Collection[str]) -> str:
     """One of several words, read at a dotted name."""
     value = OmegaConf.select(cfg, setting)
     require(value in options, setting, value, "one of " + ", ".join(options))
     return str(value)
+
+
+def words(cfg: DictConfig, setting: str, options: Collection[str]) -> list[str]:
+    """One or several of some words, read at a dotted name."""
+    value = OmegaConf.select(cfg, setting)
+    given = list(value) if OmegaConf.is_list(value) else [value]
+    require(len(given) > 0 and set(given) <= set(options), setting, given, "some of " + ", ".join(options))
+    return given
+
+
+def device_of(cfg: DictConfig) -> str:
+    """The setting `device`, where the machine has it."""
+    device = choice(cfg, "device", ("cpu", "cuda"))
+    require(device == "cpu" or torch.cuda.is_available(), "device", device, "cpu, or cuda on a machine that has it")
+    return device
 
 
 def whole(cfg: DictConfig, setting: str, least: int = 1) -> int:
@@ -62,11 +86,25 @@ def number(cfg: DictConfig, setting: str) -> float:
 
 
 def within(cfg: DictConfig, setting: str, least: float, most: float, expected: str) -> float:
-    """A number from `least` to `most`, read at a name; `expected` says so."""
-    value = cfg[setting]
-    require(is_number(value), setting, value, f"a number: {expected}")
+    """A number from `least` to `most`, read at a dotted name; `expected` says so."""
+    value = OmegaConf.select(cfg, setting)
     require(least <= value <= most, setting, value, expected)
     return float(value)
+
+
+def numbers(cfg: DictConfig, setting: str, least: float = -math.inf, most: float = sys.float_info.max) -> list[float]:
+    """A list of numbers from `least` to `most`, all that are finite by default, read at a dotted name."""
+    values = OmegaConf.select(cfg, setting)
+    expected = "a list of numbers" if least == -math.inf else f"a list of numbers, at least {least:g}"
+    require(len(values) > 0 and all(least <= value <= most for value in values), setting, values, expected)
+    return [float(value) for value in values]
+
+
+def wholes(cfg: DictConfig, setting: str, least: int) -> list[int]:
+    """A list of whole numbers no smaller than `least`, read at a dotted name."""
+    values = numbers(cfg, setting)
+    require(all(v.is_integer() and v >= least for v in values), setting, values, f"whole numbers, at least {least}")
+    return [int(value) for value in values]
 
 
 def is_whole(value: Any) -> bool:

@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from torchfovea.commands.shared.named import build_named, name_of
+from torchfovea.commands.shared.settings import within
 from torchfovea.deciding import strategies
 from torchfovea.deciding.strategies import Strategy, View
 from torchfovea.deciding.weighted import Weighting
@@ -27,22 +28,12 @@ __all__ = [
     "infomax",
     "oracle",
     "raster",
-    "read_number",
     "ucb",
     "ucb_cost",
     "weighted",
 ]
 
 FORM = "a function of a View that returns a score for each cell"
-
-
-def read_number(cfg: DictConfig, setting: str, expected: str, least: float = -math.inf) -> float:
-    """A number read at a dotted name, not below `least`."""
-    value = OmegaConf.select(cfg, setting)
-    good = isinstance(value, int | float) and not isinstance(value, bool) and value >= least
-    require(good, setting, value, expected)
-    assert value is not None
-    return float(value)
 
 
 def build_strategy(cfg: DictConfig, observer: Observer, best: Tensor | None = None) -> Strategy:
@@ -93,22 +84,21 @@ def _checked(strategy: Strategy, name: str) -> Strategy:
     return scored
 
 
-def _number(value: Any, setting: str, expected: str, least: float) -> float:
-    good = isinstance(value, int | float) and not isinstance(value, bool) and value >= least
-    require(good, f"acquisition.{setting}", value, expected)
+def _number(value: float, setting: str, expected: str, least: float = 0.0) -> float:
+    require(value >= least, f"acquisition.{setting}", value, expected)
     return float(value)
 
 
-def _alpha(value: Any) -> float:
-    return _number(value, "alpha", "a number of at least 0, or inf", 0.0)
+def _alpha(value: float) -> float:
+    return _number(value, "alpha", "a number of at least 0, or inf")
 
 
-def _unit(value: Any) -> str:
+def _unit(value: str) -> str:
     require(value in ("degrees", "seconds"), "acquisition.unit", value, "degrees or seconds")
-    return str(value)
+    return value
 
 
-def _overhead(value: Any) -> float:
+def _overhead(value: float) -> float:
     return _number(value, "overhead", "a positive number of degrees or seconds", 1e-9)
 
 
@@ -119,7 +109,7 @@ def ucb(alpha: float) -> Strategy:
 
 def ucb_cost(alpha: float, weight: float, unit: str = "degrees") -> Strategy:
     """The upper confidence bound less `weight` for every degree or second of the saccade."""
-    weight = _number(weight, "weight", "reward per degree or second, at least 0", 0.0)
+    weight = _number(weight, "weight", "reward per degree or second, at least 0")
     least = strategies.upper_confidence_bound_less_cost
     return partial(least, alpha=_alpha(alpha), weight=weight, unit=_unit(unit))
 
@@ -132,12 +122,12 @@ def ei_cost(overhead: float, unit: str = "degrees") -> Strategy:
 def hedge(alpha: float, eta: float) -> Strategy:
     """A portfolio of the upper confidence bound, the probability of improvement and the expected improvement."""
     members = (ucb(alpha), strategies.probability_of_improvement, strategies.expected_improvement)
-    return partial(strategies.hedge, members=members, eta=_number(eta, "eta", "a number of at least 0", 0.0))
+    return partial(strategies.hedge, members=members, eta=_number(eta, "eta", "a number of at least 0"))
 
 
 def raster(spacing_deg: float) -> Strategy:
     """A serpentine scan."""
-    spacing = _number(spacing_deg, "spacing_deg", "an angle between 0 and 180 degrees", 0.0)
+    spacing = _number(spacing_deg, "spacing_deg", "an angle between 0 and 180 degrees")
     return partial(strategies.raster, spacing_deg=spacing)
 
 
@@ -180,9 +170,9 @@ def weighted(observer: Observer, saccades: int, **weights: float) -> Strategy:
 
 def build_stop(cfg: DictConfig) -> StopRule | None:
     """When the best is known well enough: (tolerance, probability), or None for never."""
-    tolerance = read_number(cfg, "stop.tolerance", "a number of at least 0, in the units of the reward", 0.0)
-    if OmegaConf.select(cfg, "stop.probability") is None:
+    expected = "a number of at least 0, in the units of the reward"
+    tolerance, probability = within(cfg, "stop.tolerance", 0, math.inf, expected), cfg.stop.probability
+    if probability is None:
         return None
-    probability = read_number(cfg, "stop.probability", "a probability between 0 and 1, or null", 0.0)
     require(0 < probability < 1, "stop.probability", probability, "a probability between 0 and 1, or null")
-    return tolerance, probability
+    return tolerance, float(probability)

@@ -25,18 +25,19 @@ def load_truth(cfg: DictConfig) -> tuple[Tensor | None, Tensor | None]:
     Raises:
         SettingError: for files that are not such maps.
     """
-    unit, unknown = (_number(cfg, name) for name in ("disparity_unit_px", "disparity_unknown"))
+    told = {name: OmegaConf.select(cfg, name) for name in ("disparity_unit_px", "disparity_unknown")}
+    for name, value in told.items():
+        require(value is None or math.isfinite(value), name, value, "a number")
+    unit, unknown = (None if value is None else float(value) for value in told.values())
     require(unit is None or unit != 0, "disparity_unit_px", unit, "the pixels that a stored 1 stands for")
     if cfg.disparity is None:
         for name in ("disparity_unit_px", "disparity_unknown", "mask"):
             require(OmegaConf.select(cfg, name) is None, name, OmegaConf.select(cfg, name), "null without a disparity")
         return None, None
-    require(isinstance(cfg.disparity, str), "disparity", cfg.disparity, "a file's name")
     truth, _ = load_disparity(Path(cfg.disparity), "disparity", unit_px=unit, unknown=unknown)
     name = OmegaConf.select(cfg, "mask")
     if name is None:
         return truth, None
-    require(isinstance(name, str), "mask", name, "a file's name")
     known, seen = load_mask(Path(name), "mask")
     require(known.shape == truth.shape, "mask", tuple(known.shape), f"the disparity's {tuple(truth.shape)}")
     return torch.where(known, truth, torch.nan), seen
@@ -62,12 +63,3 @@ def load_mask(path: Path, setting: str) -> tuple[Tensor, Tensor]:
     require(fits, setting, path, "a grey image, or an NPY array (H, W) of bool or unsigned whole numbers")
     require(bool(values.any()), setting, path, "a mask that leaves something to judge")
     return torch.from_numpy(values > 0), torch.from_numpy(values == values.max())
-
-
-def _number(cfg: DictConfig, name: str) -> float | None:
-    value = OmegaConf.select(cfg, name)
-    if value is None:
-        return None
-    number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    require(number, name, value, "a number")
-    return float(value)

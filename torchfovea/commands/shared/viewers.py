@@ -23,7 +23,6 @@ from torchfovea.metrics import global_information
 from torchfovea.perception import Observer
 from torchfovea.search import Glance
 from torchfovea.sensing.head import gaze_point
-from torchfovea.setting import require
 
 __all__ = ["Show", "check_viewer", "viewers"]
 
@@ -40,7 +39,6 @@ def check_viewer(cfg: DictConfig) -> bool:
         SettingError: for another viewer, and for one that is not installed.
     """
     viewer = "" if cfg.viewer is None else choice(cfg, "viewer", ("page", "rerun"))
-    require(isinstance(cfg.video, bool), "video", cfg.video, "true or false")
     if viewer == "rerun":
         need("rerun")
     if viewer == "page" or cfg.video:

@@ -17,7 +17,7 @@ from torchfovea.commands.shared.build import build_observer, construct, name_of,
 from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.manifest import complete, finished
 from torchfovea.commands.shared.screen import progress_bar
-from torchfovea.commands.shared.strategy import read_number
+from torchfovea.commands.shared.settings import within
 from torchfovea.commands.shared.unread import refuse_unread
 from torchfovea.commands.tune.files import write_memory, write_scenes
 from torchfovea.commands.tune.judge import build_start, judge_policies, move_start
@@ -51,24 +51,15 @@ UNREAD = (
 def build_problem(cfg: DictConfig) -> Problem:
     """What is tuned, from a configuration."""
     node: Any = OmegaConf.to_container(cfg.distribution, resolve=True)
-    regions = node.pop("regions", None)
-    rows = isinstance(regions, list) and all(isinstance(row, list) and len(row) == 4 for row in regions)
-    require(rows, "distribution.regions", regions, "a list of [azimuth low, high, elevation low, high]")
     unknown = sorted(set(node) - set(Distribution.__dataclass_fields__))
     require(not unknown, "distribution", unknown, "settings of a scene distribution only")
-    for region in regions:
-        for value in region:
-            known = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-            require(known, "distribution.regions", region, "four numbers of degrees")
-    distribution = replace(construct(Distribution, node, "distribution"), regions=tuple(map(tuple, regions)))
-    cost = read_number(cfg, "saccade_cost", "worth per degree, at least 0", 0.0)
+    distribution = construct(Distribution, node, "distribution")
+    cost = within(cfg, "saccade_cost", 0, math.inf, "worth per degree, at least 0")
     task = Task(build_observer(cfg), whole(cfg, "saccades", 2), number(cfg, "far_m"), str(cfg.metric), cost)
     known = name_of(cfg, "acquisition") in ("ucb", "weighted")
     require(known, "acquisition", cfg.acquisition.name, "ucb, whose alpha is tuned, or weighted")
     weights, tuned = _weights(cfg)
-    alpha = read_number(cfg, "acquisition.alpha", "a number of at least 0", 0.0)
-    for setting in ("tune_alpha", "tune_fov", "prior_field"):
-        require(isinstance(cfg[setting], bool), setting, cfg[setting], "true or false")
+    alpha = within(cfg, "acquisition.alpha", 0, math.inf, "a number of at least 0")
     fov_deg = float(cfg.sensor.fov_deg) if cfg.tune_fov else None
     components = whole(cfg, "components")
     task_numbers = distribution.task_numbers
@@ -78,7 +69,6 @@ def build_problem(cfg: DictConfig) -> Problem:
 
 def _weights(cfg: DictConfig) -> tuple[Weighting, tuple[str, ...]]:
     """The acquisition's weights besides α, and which of them are tuned."""
-    require(OmegaConf.is_list(cfg.tune_weights), "tune_weights", cfg.tune_weights, "a list, [...]")
     tuned = tuple(str(name) for name in cfg.tune_weights)
     if cfg.acquisition.name == "ucb":
         require(not tuned, "tune_weights", list(tuned), "[] without acquisition=weighted")
@@ -111,8 +101,7 @@ def _run(cfg: DictConfig) -> float:
     heldout = Heldout(sizes["heldout_scenes"], whole(cfg, "heldout_seed", 0))
     start = build_start(cfg, problem.shape)
     if cfg.resume is not None:
-        there = isinstance(cfg.resume, str) and Path(cfg.resume).is_file()
-        require(there, "resume", cfg.resume, "a checkpoint.pt that exists")
+        require(Path(cfg.resume).is_file(), "resume", cfg.resume, "a checkpoint.pt that exists")
     folder = run_folder()
     checkpoint = folder / "checkpoint.pt"
     before = finished(cfg, folder, "heldout.tuned.gap_per_saccade")

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from torch import Tensor
 
 from torchfovea.commands.shared.build import whole
@@ -62,8 +62,6 @@ def _read(path: Path, columns: tuple[str, ...]) -> list[list[str]]:
 def check_study(cfg: DictConfig) -> None:
     """Raise SettingError for a study, a method or an estimator that there is none of."""
     require(cfg.study in (None, "curves", "gradients"), "study", cfg.study, "null, curves or gradients")
-    for name in ("methods", "estimators"):
-        require(OmegaConf.is_list(cfg[name]), name, cfg[name], "a list, [...]")
     whole(cfg, "seeds")
     check_methods([str(method) for method in cfg.methods])
     for name in cfg.estimators:
