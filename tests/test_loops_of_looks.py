@@ -3,7 +3,7 @@
 import pytest
 import torch
 from test_compiling import CAMERA
-from test_loops import both
+from test_loops import CLOSE, both, same
 
 from torchfovea import LogPolar, Observer
 from torchfovea.sensing.camera import image_camera
@@ -15,8 +15,12 @@ from torchfovea.sim.rays import render_together
 from torchfovea.sim.scene import AttentionWorld, build_scene, stand_at
 from torchfovea.sim.texture import Paint, colour
 from torchfovea.sim.world import World
+from torchfovea.stereo.costs import Eye
 from torchfovea.stereo.matchers import Matcher
 from torchfovea.stereo.sgbm import SGBM
+from torchfovea.stereo.sheets import sheets
+from torchfovea.stereo.subpixel import Neighbourhood, subpixel
+from torchfovea.stereo.visibility import outdone
 
 
 def test_a_loop_sees_what_rays_meet():
@@ -53,6 +57,43 @@ def test_a_loop_paints_as_the_definition(repeat_m):
     error = (one - other).abs().amax(0)
     # beside a seam of what repeats, rounding may put a place on either side
     assert error.median() < 1e-4 and error.quantile(0.99) < 1e-3
+
+
+@pytest.mark.parametrize("dtype", CLOSE)
+@pytest.mark.parametrize("step", [1, 2])
+def test_a_loop_outdoes_as_the_definition(step, dtype):
+    """Crowded and lonely claims, on the border and beyond it, and such as do not count."""
+    generator = torch.Generator().manual_seed(0)
+    cell = torch.stack([torch.randint(-1, side + 1, (2, 4000), generator=generator) for side in (70, 9)], -1)
+    disparity, misfit = torch.rand(2, 2, 4000, generator=generator, dtype=torch.float64)
+    disparity, misfit = (12 * disparity).to(dtype), misfit.to(dtype)
+    valid = torch.rand(2, 4000, generator=generator) < 0.3
+    (lost, rivals), (lost_too, rivals_too) = both(lambda: outdone(cell, (9, 70), disparity, misfit, valid, step))
+    assert 0.1 < float(lost.double().mean()) < 0.3 and not bool((lost & ~valid).any())
+    assert torch.equal(lost, lost_too) and torch.equal(rivals, rivals_too)
+
+
+@pytest.mark.parametrize("dtype", CLOSE)
+@pytest.mark.parametrize("radius", [1, 2])
+def test_a_loop_refines_as_the_definition(radius, dtype):
+    """On closed bands and open lattices, of two pairs of images, texture and none, where few cells are trusted."""
+    generator = torch.Generator().manual_seed(0)
+    retina, here, like = LogPolar(900), torch.device("cpu"), {"generator": generator, "dtype": torch.float64}
+    rough = torch.rand(2, 4, 48, 48, **like) - 0.5
+    rough[..., :16] *= 1e-3
+    levels = torch.stack([rough, 0.8 * rough.roll(1, -1) + 0.01 * torch.rand(rough.shape, **like)])
+    turn = torch.eye(3, dtype=dtype).expand(2, 3, 3)
+    shift, ahead = (torch.tensor([row] * 2, dtype=dtype) for row in ([-0.1, 0.0, 0.0], [0.0, 0.0, 1.0]))
+    images = levels.to(dtype).unbind(0)
+    eye = Eye(CAMERA, CAMERA, turn, shift, ahead, *images, retina, 48 / 200, (23.5, 23.5))
+    parts = sheets(retina, 200 / 48, here, dtype)
+    assert {sheet.closed for sheet in parts} == {True, False}
+    for sheet in parts:
+        surface = 0.5 + torch.rand(2, *sheet.width_px.shape, **like).to(dtype)
+        trusted = torch.rand(surface.shape, generator=generator) < 0.6
+        found = both(lambda: subpixel(eye, sheet, surface, 0.2 * surface, trusted, Neighbourhood(radius)))  # noqa: B023
+        assert float(found[0].value.std()) > 0.02
+        same(*map(tuple, found), dtype)
 
 
 def test_a_photometric_look_by_loops():

@@ -30,6 +30,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.gaussian import columns
+from torchfovea.machine import loops
 from torchfovea.stereo.costs import Eye, project, read_other, read_own, sheet_rays
 from torchfovea.stereo.sheets import Sheet, average
 
@@ -87,8 +88,16 @@ def subpixel(eye: Eye, sheet: Sheet, surface: Tensor, unit: Tensor, trusted: Ten
     closed, (radius, noise, smooth) = sheet.closed, about
     ray = sheet_rays(eye, sheet.px)
     places = torch.stack([surface - STEP * unit, surface, surface + STEP * unit], 1)
-    before, right, after = read_other(eye, sheet, ray, places).unbind(1)
-    back, left, ahead = read_own(eye, sheet, ray, STEP * unit).unbind(1)
+    other, own = read_other(eye, sheet, ray, places), read_own(eye, sheet, ray, STEP * unit)
+    library = loops(other, own)
+    if library is not None:
+        told = other.new_empty(5, *surface.shape)
+        seen = (*surface.shape, closed, other.contiguous(), own.contiguous(), trusted.contiguous())
+        samples = (_samples(radius, 1), _samples(radius, WIDE))
+        library("refine", (*seen, radius, WIDE, STEP, noise, smooth, *samples), told)
+        return Offset(*told.unbind(0))
+    before, right, after = other.unbind(1)
+    back, left, ahead = own.unbind(1)
     rx, lx = (after - before) / (2 * STEP), (ahead - back) / (2 * STEP)
 
     signals = torch.stack([left, right, lx, rx], 1)

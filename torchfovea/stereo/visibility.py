@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.gaussian import columns
+from torchfovea.machine import loops
 from torchfovea.sensing.retina import Retina
 from torchfovea.stereo.sheets import average
 
@@ -41,6 +42,12 @@ def outdone(
         bool (B, N); and by how much the farthest rival's disparity differs, outdone or not, (B, N) in cells, 0: none.
     """
     rows, across = shape
+    library = loops(disparity, misfit)
+    if library is not None:
+        lost, rivals = torch.empty_like(valid), torch.empty_like(disparity)
+        parts = (part.contiguous() for part in (cell.movedim(-1, 0), disparity, misfit, valid))
+        library("outdone", (*valid.shape, rows, across, *parts, APART / step, CLEAR ** (1 / step)), lost, rivals)
+        return lost, rivals
     column, row = cell.unbind(-1)
     valid = valid & (column >= 0) & (column < across) & (row >= 0) & (row < rows)
     width = across + 2 * NEAR
