@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.ndimage import convolve
+from test_loops import CLOSE, both
 
 from torchfovea.sensing.camera import Fisheye, Pinhole, image_camera
 from torchfovea.sensing.correspondence import Budget, eye_sigma_px
@@ -11,10 +12,12 @@ from torchfovea.sensing.head import Eyes
 from torchfovea.sensing.layout import LogPolar, Uniform
 from torchfovea.sensing.triangulation import observe
 from torchfovea.setting import SettingError
+from torchfovea.stereo.costs import left_eye
 from torchfovea.stereo.matchers import Matcher, match_all
 from torchfovea.stereo.rig import posed, verged
 from torchfovea.stereo.semiglobal import aggregate
 from torchfovea.stereo.sheets import average, nearest_rf, read_sheet, sheets
+from torchfovea.stereo.surfaces import win
 from torchfovea.stereo.sweep import Sweep, Volume, match_sweep
 from torchfovea.stereo.views import batched_views, rectified_views, verged_views
 
@@ -242,6 +245,33 @@ def test_what_cannot_be_one_batch_is_matched_one_by_one():
         found = match_all(matchers, views, retina, Budget())
         for matcher, view, (matches, _) in zip(matchers, views, found, strict=True):
             assert torch.equal(matches.right_px, match_sweep(view, retina, matcher.params, Budget())[0].right_px)
+
+
+@pytest.mark.parametrize("retina", [LogPolar(3000), Uniform(2000)], ids=["log_polar", "uniform"])
+@pytest.mark.parametrize("camera", [Pinhole.from_fov(90.0, 100.0), Fisheye.from_fov(120.0, 100.0)], ids=["pin", "fish"])
+@pytest.mark.parametrize(
+    "params", [Sweep(uniqueness=1.0), Sweep(window=2, per_width=0.5, smooth_large=0.3)], ids=["own", "other"]
+)
+def test_loops_choose_the_winners_of_the_definition(retina, camera, params, dtype):
+    """Of two pairs with as many hypotheses as each needs, everywhere and within bounds; long and closed lines too."""
+    rooms = [Room([WALL], vergence=v, camera=camera, seed=k) for k, v in enumerate((0.1, 0.25))]
+    generator, clear = torch.Generator().manual_seed(0), []
+    noisy = [[i + 0.2 * torch.rand(i.shape, generator=generator) for i in room.images(64)] for room in rooms]
+    views = batched_views(
+        [r.views(*(i.to(dtype).clamp(0, 1) for i in own)) for r, own in zip(rooms, noisy, strict=True)]
+    )
+    eye = left_eye(views.grey(), views, retina)
+    low = torch.rand(2, retina.count, generator=generator, dtype=dtype)
+    for sheet in sheets(retina, 1 / eye.scale, torch.device("cpu"), dtype):
+        for bounds in ((low.new_zeros(1, 1), low.new_full((1, 1), 3.0)), (low, low + 0.4)):
+            one, other = both(lambda: win(eye, sheet, params, *bounds))  # noqa: B023
+            clear.append(one.clear.double().mean())
+            # rounding settles ties, and which quarter of a hypothesis is the nearest
+            assert (one.clear == other.clear).double().mean() >= 0.998
+            slack = CLOSE[dtype]["rtol"] * one.step
+            near = ((one.rho - other.rho).abs() <= slack) & ((one.step - other.step).abs() <= slack)
+            assert near.double().mean() >= 0.995
+    assert 0.3 < sum(clear) / len(clear) < 0.995
 
 
 def test_precision_and_colour(dtype):

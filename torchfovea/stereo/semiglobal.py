@@ -13,7 +13,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-__all__ = ["aggregate"]
+__all__ = ["RUN_IN", "SEGMENT", "aggregate"]
 
 SEGMENT = 48
 RUN_IN = 12

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from torchfovea.machine import Loops, columns_of, loops
+from torchfovea.sensing.camera import Pinhole
 from torchfovea.setting import check_types, require
-from torchfovea.stereo.costs import Eye, correlate, inverse_depths, own_values, project, sheet_rays
-from torchfovea.stereo.semiglobal import aggregate
+from torchfovea.stereo.acuity import level_of
+from torchfovea.stereo.costs import Eye, Hypotheses, Looks, correlate, inverse_depths, own_values, project, sheet_rays
+from torchfovea.stereo.semiglobal import RUN_IN, SEGMENT, aggregate
 from torchfovea.stereo.sheets import Sheet, nearest_rf, read_sheet
 from torchfovea.stereo.subpixel import Neighbourhood, smoothed, steps_per_width, subpixel
 
@@ -135,38 +138,71 @@ def match_sheet(eye: Eye, sheet: Sheet, params: Sweep, low: Tensor, high: Tensor
     return (sheet.rf, *read_sheet(sheet, values, winner.rho, good, 1.5 * winner.step))
 
 
+class _Trial(NamedTuple):
+    """What is tried on a sheet.
+
+    Attributes:
+        own: what its cells see.
+        ray: (B, R, S, 3), see `sheet_rays`.
+        hypotheses: of inverse depth.
+        bounds: of it, (B or 1, R, S) each, and how far beyond these each hypothesis (B, D) may lie; None: everywhere.
+    """
+
+    own: Looks
+    ray: Tensor
+    hypotheses: Hypotheses
+    bounds: tuple[Tensor, Tensor, Tensor] | None
+
+
 @torch.no_grad()
 def win(eye: Eye, sheet: Sheet, params: Sweep, low: Tensor, high: Tensor) -> Winner:
     """The best hypotheses between bounds, see `match_sheet`."""
     low, high = (_at_cells(eye, sheet, bound) for bound in (low, high))
     least, most = low.amin((1, 2)).expand(len(eye.R)), high.amax((1, 2)).expand(len(eye.R))
     most = torch.maximum(most, least + 1e-6)
-    rho, number = inverse_depths(eye, sheet, least, most, params.per_width, params.hypotheses)
-    own, ray = own_values(eye, sheet, params.window, params.noise), sheet_rays(eye, sheet.px)
-    cost = ray.new_empty(*rho.shape, *sheet.width_px.shape)
-    chunk = max(1, CHUNK // ray[..., 0].numel())
-    if bounded := low.shape[-1] > 1:
+    tried = inverse_depths(eye, sheet, least, most, params.per_width, params.hypotheses)
+    bounds = None
+    if low.shape[-1] > 1:
         # the widest bound is none; those that lie between two hypotheses leave the nearer one
-        low = torch.where(low > least[:, None, None], low, -math.inf)[:, None]
-        high = torch.where(high < most[:, None, None], high, math.inf)[:, None]
-        gap = rho.diff(dim=1)[..., None, None] / 2
-        slack = torch.maximum(torch.cat([gap[:, :1], gap], 1), torch.cat([gap, gap[:, -1:]], 1))
+        low = torch.where(low > least[:, None, None], low, -math.inf)
+        high = torch.where(high < most[:, None, None], high, math.inf)
+        gap = tried.rho.diff(dim=1) / 2
+        bounds = low, high, torch.maximum(torch.cat([gap[:, :1], gap], 1), torch.cat([gap, gap[:, -1:]], 1))
+    own = own_values(eye, sheet, params.window, params.noise)
+    trial = _Trial(own, sheet_rays(eye, sheet.px), tried, bounds)
+    library = loops(eye.others, trial.ray, tried.rho)
+    if library is not None:
+        return _by_loops(library, eye, sheet, params, trial)
+    return _best(_costs(eye, sheet, params, trial), sheet, params, trial)
+
+
+def _costs(eye: Eye, sheet: Sheet, params: Sweep, trial: _Trial) -> Tensor:
+    """What each hypothesis costs at each cell, (B, D, R, S), up to 1; infinite past a pair's own."""
+    rho, number = trial.hypotheses
+    cost = trial.ray.new_empty(*rho.shape, *sheet.width_px.shape)
+    chunk = max(1, CHUNK // trial.ray[..., 0].numel())
     for k in range(0, rho.shape[1], chunk):
         some = rho[:, k : k + chunk, None, None]
-        z, seen = correlate(eye, sheet, own, ray, some, params.window, params.noise)
-        if bounded:
-            reach = slack[:, k : k + chunk]
-            seen = seen & (some >= low - reach) & (some <= high + reach)
+        z, seen = correlate(eye, sheet, trial.own, trial.ray, some, params.window, params.noise)
+        if trial.bounds is not None:
+            low, high, slack = trial.bounds
+            reach = slack[:, k : k + chunk, None, None]
+            seen = seen & (some >= low[:, None] - reach) & (some <= high[:, None] + reach)
         cost[:, k : k + chunk] = torch.where(seen, 1 - z, torch.ones_like(z)).clamp_(max=1)
-    last = number[:, None, None] - 1
-    place = torch.arange(rho.shape[1], device=rho.device)
-    if len(rho) > 1:  # what is past a pair's own hypotheses is none
-        cost.masked_fill_((place > last[:, 0])[..., None, None], math.inf)
-    total = aggregate(cost, own.values[:, 0], sheet.closed, params.smooth_small, params.smooth_large, params.contrast)
+    if len(rho) > 1:
+        past = torch.arange(rho.shape[1], device=rho.device) >= number[:, None]
+        cost.masked_fill_(past[..., None, None], math.inf)
+    return cost
+
+
+def _best(cost: Tensor, sheet: Sheet, params: Sweep, trial: _Trial) -> Winner:
+    """The hypotheses that cost least with their neighbours'."""
+    (rho, number), values = trial.hypotheses, trial.own.values[:, 0]
+    total = aggregate(cost, values, sheet.closed, params.smooth_small, params.smooth_large, params.contrast)
     best = total.amin(0)
-    index = place.to(torch.int16)[:, None, None, None]
+    index = torch.arange(len(total), device=rho.device, dtype=torch.int16)[:, None, None, None]
     win = torch.where(total == best, index, len(total)).amin(0).long()
-    inner = torch.minimum(win.clamp(min=1), last - 1)
+    inner = torch.minimum(win.clamp(min=1), number[:, None, None] - 2)
     before, here, after = (total.gather(0, (inner + k)[None])[0] for k in (-1, 0, 1))
     for k in range(-2, 3):  # what is left are other surfaces
         total.scatter_(0, (win + k).clamp(0, len(total) - 1)[None], math.inf)
@@ -177,6 +213,36 @@ def win(eye: Eye, sheet: Sheet, params: Sweep, low: Tensor, high: Tensor) -> Win
     first, middle, third = (rho.gather(1, (inner + k).flatten(1)).view_as(best) for k in (-1, 0, 1))
     step = torch.where(part < 0, middle - first, third - middle)
     return Winner(middle + part * step, step, clear)
+
+
+def _by_loops(library: Loops, eye: Eye, sheet: Sheet, params: Sweep, trial: _Trial) -> Winner:
+    """`_costs` and `_best` by the loops of sweep.c; of cameras that are no pinholes the latter."""
+    (rho, number), own = trial.hypotheses, trial.own
+    shape = (len(rho), *sheet.width_px.shape)
+    camera, (across, down) = eye.other, eye.other_middle or eye.middle
+    seen: tuple[Any, ...] = (0, 0, 0, None, None, None)
+    given, lens = None, (0.0, 0.0, 0.0)
+    low, high, slack = trial.bounds or (None, None, None)
+    if isinstance(camera, Pinhole):
+        level = level_of(sheet.width_px, eye.scale).clamp(max=eye.others.shape[1] - 1)
+        seen = (*eye.others.shape[1:], eye.others.contiguous(), level.contiguous(), eye.t.contiguous())
+        lens = (camera.focal_px, camera.cx_px, camera.cy_px)
+        if trial.bounds is not None:
+            low, high = (bound.expand(shape).contiguous() for bound in trial.bounds[:2])
+    else:
+        given, low, high, slack = _costs(eye, sheet, params, trial), None, None, None
+    looks = (part.expand(len(rho), 1, *shape[1:]).contiguous() for part in own)
+    cells = (*shape, sheet.closed, rho.shape[1], rho.contiguous(), number, columns_of(trial.ray), *looks)
+    numbers = (params.noise, params.smooth_small, params.smooth_large, params.contrast, params.uniqueness)
+    found = Winner(rho.new_empty(shape), rho.new_empty(shape), torch.empty(shape, dtype=torch.bool))
+    library(
+        "sweep",
+        (*cells, low, high, slack, given),
+        (*seen, *map(float, (*lens, eye.retina.radius_px, eye.scale, across, down))),
+        (params.window, SEGMENT, RUN_IN, *map(float, numbers)),
+        tuple(found),
+    )
+    return found
 
 
 def _at_cells(eye: Eye, sheet: Sheet, bound: Tensor) -> Tensor:
