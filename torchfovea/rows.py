@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor
 from torchfovea.memory.nearest import CellIndex, index_of_set, join_indices
 from torchfovea.setting import require
 
-__all__ = ["row", "stack"]
+__all__ = ["each", "row", "stack", "to_device"]
 
 
 def stack(rows: Sequence[Any]) -> Any:
@@ -50,3 +50,16 @@ def row(value: Any, b: int) -> Any:
         parts = [row(part, b) for part in value]
         return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
     return value[b] if isinstance(value, Tensor) else value
+
+
+def each(change: Callable[[Tensor], Tensor], value: Any, kept: tuple[type, ...] = ()) -> Any:
+    """Every tensor in nested tuples changed; whatever else there is stays, and so does what is of a kept kind."""
+    if isinstance(value, tuple) and not isinstance(value, kept):
+        parts = [each(change, part, kept) for part in value]
+        return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
+    return change(value) if isinstance(value, Tensor) else value
+
+
+def to_device(value: Any, device: torch.device | str) -> Any:
+    """Nested tuples with their tensors on another device."""
+    return each(lambda part: part.to(device), value)

@@ -17,12 +17,12 @@ from torchfovea.deciding.acquisition import known_well_enough
 from torchfovea.deciding.strategies import Strategy, View
 from torchfovea.envs.places import CellPlaces, GeometricPlaces, PhotometricPlaces, RobotPlaces, SearchPlaces
 from torchfovea.envs.settings import EnvSettings, search_settings
-from torchfovea.gaussian import Information
 from torchfovea.memory.cell_index import CellIndex
 from torchfovea.memory.egosphere import Memory, trust
 from torchfovea.memory.nearest import join_indices
 from torchfovea.metrics import gap, information, near_target
 from torchfovea.perception import Step, decide, gaze_at, new_memory
+from torchfovea.rows import each
 from torchfovea.search import Look, Robot
 from torchfovea.sensing.head import Gaze, fixate
 from torchfovea.setting import require
@@ -222,7 +222,7 @@ class SearchRows:
         self.known[rows, now], self.locally[rows, now] = self.known[rows, now - 1], self.locally[rows, now - 1]
 
     def _memory(self, rows: list[int]) -> Memory:
-        memory: Memory = _take(self.memory, rows)
+        memory: Memory = each(lambda part: part[rows], self.memory, (CellIndex,))
         return memory._replace(lookup=self._index(len(rows)))
 
     def _worth(self, rows: list[int]) -> Tensor:
@@ -247,32 +247,14 @@ class SearchRows:
 
 def _spread(memory: Memory, count: int, lookup: CellIndex) -> Memory:
     """One memory (1, Nx, ...), or one without an axis, for `count` rows."""
+    lone = memory.cells.dim() == 2
 
-    def several(part: Any) -> Any:
-        if isinstance(part, Information):
-            return Information(*(several(inner) for inner in part))
-        if not isinstance(part, Tensor):
-            return part
+    def several(part: Tensor) -> Tensor:
+        part = part[None] if lone else part
         return part.expand(count, *part.shape[1:]).clone()
 
-    if memory.cells.dim() == 2:
-        memory = Memory(*(_lead(part) for part in memory))
-    return Memory(*(several(part) for part in memory))._replace(lookup=lookup)
-
-
-def _lead(part: Any) -> Any:
-    if isinstance(part, Information):
-        return Information(*(inner[None] for inner in part))
-    return part[None] if isinstance(part, Tensor) else part
-
-
-def _take(value: Any, rows: list[int]) -> Any:
-    """Rows of every tensor in nested tuples, indices of cells left alone."""
-    if isinstance(value, CellIndex):
-        return value
-    if isinstance(value, tuple):
-        return type(value)(*(_take(part, rows) for part in value))
-    return value[rows] if isinstance(value, Tensor) else value
+    spread: Memory = each(several, memory, (CellIndex,))
+    return spread._replace(lookup=lookup)
 
 
 def _put(whole: Any, rows: list[int], part: Any) -> Any:

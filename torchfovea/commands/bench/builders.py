@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from functools import cache
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from torchfovea.commands.bench.episodes import episode, photometric_saccade, picture, tuning_episode
 from torchfovea.commands.bench.look import Saccade, saccade
@@ -18,7 +18,7 @@ from torchfovea.commands.bench.steps import batched_steps, paths_of_steps
 from torchfovea.commands.bench.timing import Path
 from torchfovea.commands.shared.build import build_cells, build_observer, choice, whole
 from torchfovea.commands.shared.rehearsal import rehearse
-from torchfovea.commands.shared.settings import construct
+from torchfovea.commands.shared.settings import changed, construct
 from torchfovea.perception import Observer
 from torchfovea.sensing.layout import LogPolar
 from torchfovea.setting import require
@@ -52,13 +52,10 @@ def builders_of(cfg: DictConfig, device: str, wanted: Sequence[str]) -> list[Cal
     plain = dataclasses.replace(full, fusion=fusion, head=head, reward="inverse_range")
     fewer = {**cfg.sensor, "receptive_fields": whole(cfg, "small.receptive_fields")}
     small = dataclasses.replace(plain, retina=construct(LogPolar, fewer, "sensor"))
-    few = OmegaConf.merge(cfg, {"memory": {"cells": whole(cfg, "small.cells")}})
-    assert isinstance(few, DictConfig)
-    images = OmegaConf.merge(cfg, {"fidelity": "photometric"})
-    assert isinstance(images, DictConfig)
+    few = changed(cfg, {"memory": {"cells": whole(cfg, "small.cells")}})
     whole(cfg, "saccades", 2), whole(cfg, "tuning.episodes", 8), whole(cfg, "tuning.cells", 2)
     choice(cfg, "fidelity", ("geometric", "photometric"))
-    rehearse(images, full.head, full)
+    rehearse(changed(cfg, {"fidelity": "photometric"}), full.head, full)
     require(full.classes is None, "reward", "of_class", "a reward of nearness, in bench")
 
     def cells_of(settings: DictConfig) -> torch.Tensor:

@@ -10,11 +10,12 @@ from functools import partial
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from torchfovea.commands.bench.timing import Path, Peer, same
 from torchfovea.commands.shared.build import build_arena, build_cells, build_scene_of, number, whole
 from torchfovea.commands.shared.rollout import roll_out
+from torchfovea.commands.shared.settings import changed
 from torchfovea.compiling import compiling
 from torchfovea.deciding.weighted import Weighting
 from torchfovea.perception import Observer, Step, compiled, decide, new_memory, perceive
@@ -64,8 +65,7 @@ def picture(cfg: DictConfig, observer: Observer, size: int) -> Path:
 
 def photometric_saccade(cfg: DictConfig, observer: Observer) -> Path:
     """All of a photometric saccade: both eyes' pictures by rays, matching, triangulation, memory, decision."""
-    settings = OmegaConf.merge(cfg, {"fidelity": "photometric", "sensor": {"sample": None}})
-    assert isinstance(settings, DictConfig)
+    settings = changed(cfg, {"fidelity": "photometric", "sensor": {"sample": None}})
     generator = torch.Generator().manual_seed(int(cfg.seed))
     memory = new_memory(observer, build_cells(cfg, observer.head, generator))
     zero = torch.zeros(())
@@ -128,8 +128,7 @@ def tuning_episode(cfg: DictConfig, observer: Observer) -> Path:
     task = Task(observer, whole(cfg, "saccades", 2), number(cfg, "far_m"))
     generator = torch.Generator().manual_seed(int(cfg.seed))
     scenes = draw_scenes(Distribution(), observer.head, episodes, generator)
-    few = OmegaConf.merge(cfg, {"memory": {"cells": episodes * cells}})
-    assert isinstance(few, DictConfig)
+    few = changed(cfg, {"memory": {"cells": episodes * cells}})
     directions = build_cells(few, observer.head, generator).reshape(episodes, cells, 3)
     noise = torch.randn(task.saccades, episodes, cells, generator=generator)
     world = world_of(task, scenes, directions, noise)

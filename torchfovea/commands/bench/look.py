@@ -13,13 +13,13 @@ from torchfovea.commands.bench.timing import Peer
 from torchfovea.gaussian import columns
 from torchfovea.memory.egosphere import Memory
 from torchfovea.perception import Observer, compiled, new_memory
-from torchfovea.rows import stack
+from torchfovea.rows import stack, to_device
 from torchfovea.sensing.correspondence import Correspondences
 from torchfovea.sensing.fields import for_all
 from torchfovea.sensing.geometric import correspond_points, with_noise
 from torchfovea.sensing.head import Eyes, eyes, fixate, to_ego
 
-__all__ = ["Saccade", "batch_of", "compiled_peer", "flat_of", "moved_to", "part_of", "saccade", "shares", "support_of"]
+__all__ = ["Saccade", "batch_of", "compiled_peer", "flat_of", "part_of", "saccade", "shares", "support_of"]
 
 
 class Saccade(NamedTuple):
@@ -42,13 +42,6 @@ class Saccade(NamedTuple):
     compile: str = "off"
 
 
-def moved_to(value: Any, device: str) -> Any:
-    """Tensors in nested tuples on another device."""
-    if isinstance(value, tuple):
-        return type(value)(*(moved_to(part, device) for part in value))
-    return value.to(device) if isinstance(value, Tensor) else value
-
-
 def saccade(observer: Observer, cells: Tensor, device: str = "cpu", seed: int = 0) -> Saccade:
     """A look of both eyes at a rolling surface, with noise, and an empty memory over `cells` (Nx, 3)."""
     gaze = fixate(observer.head, torch.tensor([1.2, 0.25, -0.1]))[0]
@@ -61,7 +54,7 @@ def saccade(observer: Observer, cells: Tensor, device: str = "cpu", seed: int = 
     generator = torch.Generator().manual_seed(seed)
     matches = correspond_points(points, seen, left, pose, observer.camera, observer.retina, observer.budget)
     matches = with_noise(matches, observer.retina, generator)
-    moved: Saccade = moved_to(Saccade(observer, new_memory(observer, cells), matches, pose), device)
+    moved: Saccade = to_device(Saccade(observer, new_memory(observer, cells), matches, pose), device)
     return moved
 
 
@@ -110,5 +103,5 @@ def batch_of(looks: Sequence[Saccade]) -> Saccade:
     device = str(first.memory.cells.device)
     matches, pose = (stack([getattr(look, part) for look in looks]) for part in ("matches", "pose"))
     places = {part: columns(*getattr(matches, part).unbind(-1)) for part in ("left_px", "right_px")}
-    memory = moved_to(new_memory(first.observer, columns(*cells.unbind(-1))), device)
+    memory = to_device(new_memory(first.observer, columns(*cells.unbind(-1))), device)
     return Saccade(first.observer, memory, matches._replace(**places), pose)

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchfovea.commands.bench import peers
-from torchfovea.commands.bench.look import Saccade, compiled_peer, flat_of, moved_to, part_of, shares, support_of
+from torchfovea.commands.bench.look import Saccade, compiled_peer, flat_of, part_of, shares, support_of
 from torchfovea.commands.bench.timing import Growth, Path, Peer, nbytes, same
 from torchfovea.compiling import compiling
 from torchfovea.gaussian import Gaussian, columns, pack, unpack
@@ -21,6 +21,7 @@ from torchfovea.memory.nearest import nearest_cell
 from torchfovea.memory.pooling import pool, pool_patches
 from torchfovea.memory.update import fuse
 from torchfovea.perception import Observer, new_memory
+from torchfovea.rows import to_device
 from torchfovea.sensing.chart import basis
 from torchfovea.sensing.triangulation import Observations, observe
 from torchfovea.sensing.unscented import SigmaPoints
@@ -113,7 +114,7 @@ def _align(look: Saccade) -> Path:
     cell_sizes = shares(len(cells))
     by_cells = tuple(
         partial(
-            nearest_cell, moved_to(new_memory(look.observer, cells[:size].cpu()), str(cells.device)).lookup, directions
+            nearest_cell, to_device(new_memory(look.observer, cells[:size].cpu()), str(cells.device)).lookup, directions
         )
         for size in cell_sizes
     )

@@ -16,7 +16,6 @@ from torchfovea.commands.bench.look import (
     batch_of,
     compiled_peer,
     flat_of,
-    moved_to,
     part_of,
     saccade,
     shares,
@@ -27,6 +26,7 @@ from torchfovea.deciding.strategies import Strategy, upper_confidence_bound
 from torchfovea.gaussian import columns, unpack
 from torchfovea.memory.egosphere import Memory
 from torchfovea.perception import Observer, decide, new_memory, perceive
+from torchfovea.rows import to_device
 from torchfovea.sensing.triangulation import observe
 from torchfovea.sensing.unscented import SigmaPoints
 
@@ -135,7 +135,7 @@ def _step(look: Saccade, full: Observer) -> list[Path]:
     work = f"{len(px)} RFs to {len(cells)} cells to the next fixation"
     sizes, cell_sizes = shares(len(px)), shares(len(cells))
     by_cells = tuple(
-        partial(_one_step, look._replace(memory=moved_to(new_memory(observer, memory.cells[:n].cpu()), device)))
+        partial(_one_step, look._replace(memory=to_device(new_memory(observer, memory.cells[:n].cpu()), device)))
         for n in cell_sizes
     )
     growths = (

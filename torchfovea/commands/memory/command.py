@@ -11,7 +11,7 @@ from torchfovea.commands.memory.moving import study_moving, study_resampling
 from torchfovea.commands.memory.study import Rows, study_encoders, study_fusion
 from torchfovea.commands.shared.build import build_arena, build_cells, build_observer, choice, number, whole
 from torchfovea.commands.shared.config import run_folder
-from torchfovea.commands.shared.memories import loaded_memory, memory_path
+from torchfovea.commands.shared.memories import aimed, loaded_memory, memory_path
 from torchfovea.commands.shared.rehearsal import rehearse
 from torchfovea.commands.shared.screen import print_figures, wide_screen
 from torchfovea.files import write_csv, write_result
@@ -43,8 +43,7 @@ def run(cfg: DictConfig) -> float:
     from torchfovea.commands.memory.pictures import draw_memory
 
     toward = torch.nn.functional.normalize(arena.world.scene.nearest_point_e.double(), dim=-1)
-    if OmegaConf.select(cfg, "memory.means", default="none") is None:  # a bias that is aimed at the scene's own target
-        cfg = OmegaConf.merge(cfg, {"memory": {"means": [toward.tolist()]}})  # type: ignore[assignment]
+    cfg = aimed(cfg, arena.world.scene)
     loaded, saved = loaded_memory(cfg, observer), memory_path(cfg, "memory.save")
     if loaded is None:
         cells = build_cells(cfg, observer.head, torch.Generator().manual_seed(seed), torch.float64)

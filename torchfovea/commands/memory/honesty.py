@@ -15,7 +15,7 @@ from torchfovea.commands.shared.build import build_arena, build_cells, build_obs
 from torchfovea.commands.shared.config import conf_dir
 from torchfovea.commands.shared.judge import Judge, fixation_course, judge_cells
 from torchfovea.commands.shared.screen import progress_bar
-from torchfovea.commands.shared.settings import wholes, words
+from torchfovea.commands.shared.settings import changed, wholes, words
 from torchfovea.memory.egosphere import Memory, belief, trust
 from torchfovea.metrics import coverage, nees_mean, outlier_share
 from torchfovea.perception import Observer, new_memory, perceive
@@ -64,7 +64,9 @@ def study_honesty(cfg: DictConfig, rows: Rows) -> None:
         for k in range(seed, seed + scenes):
             first = build_arena(settings[sensors[0]], observers[sensors[0]], k)
             generator = torch.Generator().manual_seed(k)
-            cells = {n: build_cells(_with_cells(cfg, n), first.observer.head, generator) for n in counts}
+            cells = {
+                n: build_cells(changed(cfg, {"memory": {"cells": n}}), first.observer.head, generator) for n in counts
+            }
             judges = {n: judge_cells(first.world, cells[n]) for n in counts}
             seeing = {
                 name: Sensor(
@@ -90,18 +92,12 @@ def plan_honesty(cfg: DictConfig) -> tuple[list[str], list[int], list[int]]:
 
 def _settings(cfg: DictConfig, sensor: str) -> DictConfig:
     """The configuration with another sensor in it."""
-    changed = cfg.copy()
-    OmegaConf.set_struct(changed, False)
-    changed.fidelity = "geometric" if sensor == "geometric" else "photometric"
+    other = cfg.copy()
+    OmegaConf.set_struct(other, False)
+    other.fidelity = "geometric" if sensor == "geometric" else "photometric"
     if sensor not in ("geometric", cfg.matcher.name):
-        changed.matcher = OmegaConf.load(Path(conf_dir()) / "matcher" / f"{sensor}.yaml")
-    return changed
-
-
-def _with_cells(cfg: DictConfig, count: int) -> DictConfig:
-    changed = OmegaConf.merge(cfg, {"memory": {"cells": count}})
-    assert isinstance(changed, DictConfig)
-    return changed
+        other.matcher = OmegaConf.load(Path(conf_dir()) / "matcher" / f"{sensor}.yaml")
+    return other
 
 
 def _look(seeing: dict[str, Sensor], gaze: Gaze, generator: torch.Generator) -> None:

@@ -19,7 +19,7 @@ from torchfovea.commands.shared.memories import loaded_memory, memory_path
 from torchfovea.commands.shared.rehearsal import rehearse
 from torchfovea.commands.shared.rollout import sample_of
 from torchfovea.commands.shared.screen import print_figures, progress_bar, say
-from torchfovea.commands.shared.settings import construct, whole
+from torchfovea.commands.shared.settings import changed, construct, whole
 from torchfovea.commands.shared.strategy import build_strategy
 from torchfovea.commands.shared.unread import refuse_unread
 from torchfovea.commands.shared.viewers import Show, check_viewer, viewers
@@ -139,10 +139,9 @@ def told_by(cfg: DictConfig, calibration: Calibration) -> DictConfig:
         require(calibration.head is not None, "head", None, expected)
         told["head"] = vars(calibration.head)
     OmegaConf.set_struct(cfg, False)
-    merged = OmegaConf.merge(cfg, told)
-    assert isinstance(merged, DictConfig)
-    name_of(merged, "sensor", "layout")
-    return merged
+    cfg = changed(cfg, told)
+    name_of(cfg, "sensor", "layout")
+    return cfg
 
 
 def _play(robot: Playback, observer: Observer, memory: Memory, glances: Any, count: int, show: Show | None) -> Replayed:

@@ -13,7 +13,7 @@ from torchfovea.commands.shared.build import build_observer
 from torchfovea.commands.shared.composed import compose_search, options
 from torchfovea.commands.shared.parallel import workers_of
 from torchfovea.commands.shared.rehearsal import rehearse
-from torchfovea.commands.shared.settings import device_of, number, numbers, whole
+from torchfovea.commands.shared.settings import device_of, number, numbers, plain, whole
 from torchfovea.setting import require
 
 __all__ = ["Plan", "checked"]
@@ -67,9 +67,8 @@ def checked(cfg: DictConfig) -> Plan:
             _condition(condition, setting)
     _condition(cfg.counts, "counts")
     require(cfg.counts in cfg.fig8.conditions, "counts", cfg.counts, "one of fig8.conditions")
-    settings: Any = OmegaConf.to_container(cfg, resolve=True)
-    plain = in_family(settings)
-    claims, tasks = read_claims(plain["claims"]), cells_of(plain)
+    told = in_family(plain(cfg))
+    claims, tasks = read_claims(told["claims"]), cells_of(told)
     for claim in claims:
         require(claim.metric in METRICS, f"claims.{claim.id}.metric", claim.metric, "one of " + ", ".join(METRICS))
     seen = set()
@@ -81,7 +80,7 @@ def checked(cfg: DictConfig) -> Plan:
             search = compose_search((*task.overrides, *task.arm))
             observer = build_observer(search)
             rehearse(search, observer.head, observer)
-    return Plan(plain, claims, tasks, workers_of(cfg))
+    return Plan(told, claims, tasks, workers_of(cfg))
 
 
 def _condition(node: Any, setting: str) -> None:

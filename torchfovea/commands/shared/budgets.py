@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchfovea.commands.shared.config import conf_dir
 from torchfovea.commands.shared.screen import say
-from torchfovea.commands.shared.settings import choice, construct, whole
+from torchfovea.commands.shared.settings import choice, construct, plain, whole
 from torchfovea.files import replacing
 from torchfovea.sensing.correspondence import Budget
 from torchfovea.setting import SettingError, require
@@ -78,9 +78,8 @@ def shipped(cfg: DictConfig) -> Path | None:
 
 def made_for(cfg: DictConfig, fov_deg: list[float], source_px: list[int]) -> dict[str, Any]:
     """What a budget names as its purpose: the matcher with its settings, the sensor, fields of view and image sizes."""
-    matcher = OmegaConf.to_container(cfg.matcher, resolve=True)
     return {
-        "matcher": matcher, "layout": cfg.sensor.layout, "receptive_fields": cfg.sensor.receptive_fields,
+        "matcher": plain(cfg.matcher), "layout": cfg.sensor.layout, "receptive_fields": cfg.sensor.receptive_fields,
         "fov_deg": sorted(set(fov_deg)), "source_px": sorted(set(source_px)),
     }  # fmt: skip
 
@@ -97,10 +96,9 @@ def write_budget(path: Path, budget: Budget, comments: list[str], sigma_points: 
 def _checked(node: Any, where: str) -> dict[str, Any]:
     """A budget's settings, all of them and no others."""
     require(OmegaConf.is_dict(node), where, node, "a budget: a mapping of its numbers")
-    values = OmegaConf.to_container(node, resolve=True)
-    assert isinstance(values, dict)
+    values = plain(node)
     missing = [name for name in KEYS if name not in values]
-    unknown = [str(name) for name in values if name not in KEYS]
+    unknown = [name for name in values if name not in KEYS]
     if missing:
         raise SettingError(f"{where}.{missing[0]} = missing: expected all of {', '.join(KEYS)}")
     if unknown:
@@ -109,7 +107,7 @@ def _checked(node: Any, where: str) -> dict[str, Any]:
     told = purpose is None or (isinstance(purpose, dict) and set(PURPOSE) <= set(purpose))
     expected = f"null, or what `torchfovea calibrate` writes: {', '.join(PURPOSE)}"
     require(told, f"{where}.made_for", purpose, expected)
-    return {str(name): value for name, value in values.items()}
+    return values
 
 
 def _filled(cfg: DictConfig, node: dict[str, Any]) -> dict[str, Any]:
@@ -130,8 +128,7 @@ def _filled(cfg: DictConfig, node: dict[str, Any]) -> dict[str, Any]:
 def _compare(cfg: DictConfig, purpose: Any, pair: bool) -> None:
     """Say in one line where a budget was made for something else."""
     other = [] if cfg.sensor.layout == purpose["layout"] else [f"sensor.layout = {purpose['layout']}"]
-    matcher = OmegaConf.to_container(cfg.matcher, resolve=True)
-    assert isinstance(matcher, dict)
+    matcher = plain(cfg.matcher)
     other += [f"matcher.{k} = {v}" for k, v in purpose["matcher"].items() if k in matcher and matcher[k] != v]
     if not pair:
         sizes, angles = purpose["source_px"], purpose["fov_deg"]

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchfovea.commands.shared.budgets import build_budget
 from torchfovea.commands.shared.named import build_named, name_of, targets_of
 from torchfovea.commands.shared.rewards import build_classes, build_reward
-from torchfovea.commands.shared.settings import choice, construct, number, whole
+from torchfovea.commands.shared.settings import changed, choice, construct, number, plain, whole
 from torchfovea.imported import load_function
 from torchfovea.memory import sphere
 from torchfovea.memory.egosphere import Fusion, Prior
@@ -126,8 +126,7 @@ def build_cells(cfg: DictConfig, head: Head, generator: torch.Generator, dtype: 
         SettingError: for no cells, a bad mixture or one that never falls within reach.
     """
     count = whole(cfg, "memory.cells")
-    memory = OmegaConf.to_container(cfg.memory, resolve=True)
-    assert isinstance(memory, dict)
+    memory = plain(cfg.memory)
 
     def reachable(directions: Tensor) -> Tensor:
         return fixate(head, REACH_RANGE_M * directions)[1]
@@ -155,9 +154,7 @@ def build_scene_of(cfg: DictConfig, head: Head, seed: int) -> Scene:
     require(known, "head", type(head).__name__, "one that the simulator knows; yours is for `replay` and a robot")
     name_of(cfg, "scene")
     if "room" in cfg.scene and "_target_" not in cfg.scene.room:  # as scene files were before _target_
-        merged = OmegaConf.merge(cfg, {"scene": {"room": {"_target_": f"{Room.__module__}.{Room.__name__}"}}})
-        assert isinstance(merged, DictConfig)
-        cfg = merged
+        cfg = changed(cfg, {"scene": {"room": {"_target_": f"{Room.__module__}.{Room.__name__}"}}})
     return build_scene(build_named(cfg, "scene", "a function (seed, head) that returns a Scene"), seed, head)
 
 

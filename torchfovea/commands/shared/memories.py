@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from torchfovea.commands.shared.settings import changed
 from torchfovea.memory.egosphere import Memory
 from torchfovea.memory.sphere import DirectionMixture
 from torchfovea.memory.store import check_memory_path, load_memory
@@ -45,9 +46,7 @@ def aimed(cfg: DictConfig, scene: Scene) -> DictConfig:
     if "means" not in cfg.memory or cfg.memory.means is not None:
         return cfg
     mean = torch.nn.functional.normalize(scene.nearest_point_e, dim=-1).tolist()
-    merged = OmegaConf.merge(cfg, {"memory": {"means": [mean]}})
-    assert isinstance(merged, DictConfig)
-    return merged
+    return changed(cfg, {"memory": {"means": [mean]}})
 
 
 def mixture_settings(mixture: DirectionMixture) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from torchfovea.commands.shared.config import conf_dir
-from torchfovea.commands.shared.settings import construct
+from torchfovea.commands.shared.settings import construct, plain
 from torchfovea.commands.shared.trust import load_trusted
 from torchfovea.imported import load_function
 from torchfovea.setting import SettingError, require, require_name
@@ -76,13 +76,12 @@ def build_named(cfg: DictConfig, group: str, form: str, without: Collection[str]
     """
     node = OmegaConf.select(cfg, group)
     require(isinstance(node, DictConfig), group, node, form)
-    plain = OmegaConf.to_container(node, resolve=True)
-    assert isinstance(plain, dict)
-    plain.setdefault("_target_", targets_of(group, key).get(str(plain.get(key))))
-    if plain["_target_"] is None:
-        require(plain.get("source") is not None, f"{group}.source", None, f"package.module:function, {form}")
-        return load_function(plain["source"], f"{group}.source")
-    settings = {str(key): value for key, value in plain.items() if key not in without}
+    told = plain(node)
+    told.setdefault("_target_", targets_of(group, key).get(str(told.get(key))))
+    if told["_target_"] is None:
+        require(told.get("source") is not None, f"{group}.source", None, f"package.module:function, {form}")
+        return load_function(told["source"], f"{group}.source")
+    settings = {key: value for key, value in told.items() if key not in without}
     return _build(settings, group, bool(OmegaConf.select(cfg, "trust")), form)
 
 

@@ -16,7 +16,7 @@ from torchfovea.commands.shared.build import (
     name_of,
 )
 from torchfovea.commands.shared.memories import aimed, loaded_memory, memory_path
-from torchfovea.commands.shared.settings import number, whole
+from torchfovea.commands.shared.settings import changed, number, whole
 from torchfovea.commands.shared.strategy import build_stop, build_strategy
 from torchfovea.perception import Observer
 from torchfovea.sensing.head import Head
@@ -64,6 +64,5 @@ def rehearse(cfg: DictConfig, head: Head, observer: Observer | None = None) -> N
         motor(scene)
     if "memory" in cfg and observer is not None:
         count = min(CELLS, whole(cfg, "memory.cells"))
-        few = OmegaConf.merge(cfg if scene is None else aimed(cfg, scene), {"memory": {"cells": count}})
-        assert isinstance(few, DictConfig)
+        few = changed(cfg if scene is None else aimed(cfg, scene), {"memory": {"cells": count}})
         build_cells(few, head, torch.Generator().manual_seed(seed))

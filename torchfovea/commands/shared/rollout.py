@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -21,7 +20,7 @@ from torchfovea.episode import Each, Episode, Rules, run_episode, run_episodes
 from torchfovea.memory.egosphere import Memory
 from torchfovea.metrics import near_target
 from torchfovea.perception import Observer, new_memory
-from torchfovea.rows import stack
+from torchfovea.rows import stack, to_device
 from torchfovea.sensing.head import Head
 from torchfovea.setting import require
 from torchfovea.sim.arenas import GeometricArenas
@@ -164,7 +163,7 @@ def roll_out(
     parts = [prepare_episode(cfg, observer, seed) for seed in seeds]
     scenes, memories, truths, generators = (list(part) for part in zip(*parts, strict=True))
     device = episodes_device(cfg) if "device" in cfg else "cpu"
-    memory = _to(stack(memories), device)
+    memory = to_device(stack(memories), device)
     if strategy is None:
         aims = stack([_aim(truth, number(cfg, "near_target_m")) for truth in truths]).to(device)
         chosen = build_strategy(cfg, observer, aims)
@@ -179,9 +178,3 @@ def roll_out(
         _rules(cfg, chosen),
         each,
     )
-
-
-def _to(value: Any, device: str) -> Any:
-    if isinstance(value, tuple):
-        return type(value)(*(_to(part, device) for part in value))
-    return value.to(device) if isinstance(value, Tensor) else value

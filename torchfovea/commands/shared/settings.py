@@ -17,8 +17,8 @@ from omegaconf import DictConfig, OmegaConf
 from torchfovea.setting import require, typed
 
 __all__ = [
-    "choice", "construct", "device_of", "is_number", "is_whole", "number", "numbers", "whole", "wholes", "within",
-    "words",
+    "changed", "choice", "construct", "device_of", "is_number", "is_whole", "number", "numbers", "plain", "whole",
+    "wholes", "within", "words",
 ]  # fmt: skip
 
 T = TypeVar("T")
@@ -43,6 +43,20 @@ def construct(kind: type[T], node: DictConfig | dict[str, Any], where: str) -> T
         if field.name in node:
             values[field.name] = typed(node[field.name], str(field.type), f"{where}.{field.name}")
     return kind(**values)
+
+
+def plain(group: Any) -> dict[str, Any]:
+    """A group of settings as a mapping, what stands for others resolved."""
+    values = OmegaConf.to_container(group, resolve=True)
+    assert isinstance(values, dict)
+    return {str(name): value for name, value in values.items()}
+
+
+def changed(cfg: DictConfig, settings: dict[str, Any]) -> DictConfig:
+    """The configuration with some settings changed, group by group."""
+    merged = OmegaConf.merge(cfg, settings)
+    assert isinstance(merged, DictConfig)
+    return merged
 
 
 def choice(cfg: DictConfig, setting: str, options: Collection[str]) -> str:

@@ -10,14 +10,14 @@ from typing import Any
 
 import torch
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from rich.console import Console
 
 from torchfovea.commands.shared.build import build_observer, construct, name_of, number, whole
 from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.manifest import complete, finished
 from torchfovea.commands.shared.screen import progress_bar
-from torchfovea.commands.shared.settings import within
+from torchfovea.commands.shared.settings import plain, within
 from torchfovea.commands.shared.unread import refuse_unread
 from torchfovea.commands.tune.files import write_memory, write_scenes
 from torchfovea.commands.tune.judge import build_start, judge_policies, move_start
@@ -50,7 +50,7 @@ UNREAD = (
 
 def build_problem(cfg: DictConfig) -> Problem:
     """What is tuned, from a configuration."""
-    node: Any = OmegaConf.to_container(cfg.distribution, resolve=True)
+    node = plain(cfg.distribution)
     unknown = sorted(set(node) - set(Distribution.__dataclass_fields__))
     require(not unknown, "distribution", unknown, "settings of a scene distribution only")
     distribution = construct(Distribution, node, "distribution")
@@ -94,10 +94,7 @@ def _run(cfg: DictConfig) -> float:
     check_study(cfg)
     whole(cfg, "seed", 0)
     problem = build_problem(cfg)
-    settings = OmegaConf.to_container(cfg, resolve=True)
-    assert isinstance(settings, dict)
-    merged = {str(name): value for name, value in settings.items()} | sizes
-    schedule = construct(Schedule, merged, "tune")
+    schedule = construct(Schedule, plain(cfg) | sizes, "tune")
     heldout = Heldout(sizes["heldout_scenes"], whole(cfg, "heldout_seed", 0))
     start = build_start(cfg, problem.shape)
     if cfg.resume is not None:

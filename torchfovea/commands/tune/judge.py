@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from rich.table import Table
 from torch import Tensor
 
-from torchfovea.commands.shared.build import whole
+from torchfovea.commands.shared.settings import plain, whole
 from torchfovea.commands.tune.files import write_memory
 from torchfovea.memory.sphere import direction_mixture, sphere_quadrature
 from torchfovea.setting import require
@@ -36,8 +36,7 @@ _FIELD_ALPHAS = (0.1, 0.3, 1.0)
 
 def build_start(cfg: DictConfig, shape: Shape) -> Tensor:
     """The vector of the bias `memory=...` with `acquisition.alpha`."""
-    memory = OmegaConf.to_container(cfg.memory, resolve=True)
-    assert isinstance(memory, dict)
+    memory = plain(cfg.memory)
     complete = all(key in memory for key in ("weights", "means", "covariances"))
     require(complete, "memory", memory.get("name"), "a bias with weights, means and covariances to start from")
     require(cfg.start in STARTS, "start", cfg.start, "one of " + ", ".join(STARTS))
