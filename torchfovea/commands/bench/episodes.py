@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
-from torchfovea.commands.bench.timing import Path, Peer, same
+from torchfovea.commands.bench.timing import Path, Peer, compiled_peer, same
 from torchfovea.commands.shared.build import build_arena, build_cells, build_scene_of, number, whole
 from torchfovea.commands.shared.rollout import roll_out
 from torchfovea.commands.shared.settings import changed
@@ -86,7 +86,7 @@ def photometric_saccade(cfg: DictConfig, observer: Observer) -> Path:
         if int(ours().cell) < 0:
             raise RuntimeError("saccade: nothing to fixate")
 
-    quick = () if cfg.compile == "off" else (Peer("ours, compiled", of(compiled(observer, cfg.compile))),)
+    quick = compiled_peer(cfg.compile, lambda mode: of(compiled(observer, mode)))
     work = f"two pictures of {int(cfg.sensor.source_px)} px by rays, {cfg.matcher.name}, to the next fixation"
     return Path("saccade", work, "cpu", ours, quick, check)
 
@@ -110,13 +110,13 @@ def episode(cfg: DictConfig, observer: Observer, batch: int, device: str, compil
             same("episode", ours.global_information[0], theirs.global_information[0], 1e-3)
 
     looks = whole(cfg, "saccades")
-    fast = partial(roll_out, cfg, compiled(observer, compile), seeds)
+    fast = compiled_peer(compile, lambda mode: partial(roll_out, cfg, compiled(observer, mode), seeds))
     return Path(
         "episode",
         f"of {looks} saccades, {observer.retina.count} RFs, {cfg.memory.cells} cells; {batch} together",
         device,
         together,
-        (Peer("one by one", alone), *(() if compile == "off" else (Peer("ours, compiled", fast),))),
+        (Peer("one by one", alone), *fast),
         check,
         units=batch,
     )

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchfovea.commands.bench.timing import Peer
 from torchfovea.gaussian import columns
 from torchfovea.memory.egosphere import Memory
-from torchfovea.perception import Observer, compiled, new_memory
+from torchfovea.perception import Observer, new_memory
 from torchfovea.rows import stack, to_device
 from torchfovea.sensing.correspondence import Correspondences
 from torchfovea.sensing.fields import for_all
 from torchfovea.sensing.geometric import correspond_points, with_noise
 from torchfovea.sensing.head import Eyes, eyes, fixate, to_ego
 
-__all__ = ["Saccade", "batch_of", "compiled_peer", "flat_of", "part_of", "saccade", "shares", "support_of"]
+__all__ = ["Saccade", "batch_of", "flat_of", "part_of", "saccade", "shares", "support_of"]
 
 
 class Saccade(NamedTuple):
@@ -64,20 +62,6 @@ def part_of(look: Saccade, count: int) -> Saccade:
     kept = look.matches.take(every)
     left_px, right_px = (columns(*part.unbind(-1)) for part in kept[:2])
     return look._replace(matches=for_all(kept._replace(left_px=left_px, right_px=right_px), look.observer.retina))
-
-
-def compiled_peer(look: Saccade, run: Callable[[Observer], Any]) -> tuple[Peer, ...]:
-    """The same work by compiled kernels, where they are to be timed too.
-
-    Args:
-        look: says whether, and by which observer.
-        run: does the work with an observer.
-    """
-    if look.compile == "off":
-        return ()
-    quick = partial(run, compiled(look.observer, look.compile))
-    quick()  # compiles
-    return (Peer("ours, compiled", quick),)
 
 
 def support_of(look: Saccade) -> Tensor:

@@ -11,16 +11,15 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchfovea.commands.bench import peers
-from torchfovea.commands.bench.look import Saccade, compiled_peer, flat_of, part_of, shares, support_of
-from torchfovea.commands.bench.timing import Growth, Path, Peer, nbytes, same
-from torchfovea.compiling import compiling
+from torchfovea.commands.bench.look import Saccade, flat_of, part_of, shares, support_of
+from torchfovea.commands.bench.timing import Growth, Path, Peer, compiled_peer, nbytes, same, within
 from torchfovea.gaussian import Gaussian, columns, pack, unpack
 from torchfovea.memory.association import Pairs, associate, gather_columns
 from torchfovea.memory.egosphere import Memory, Prior, belief, empty_memory
 from torchfovea.memory.nearest import nearest_cell
 from torchfovea.memory.pooling import pool, pool_patches
 from torchfovea.memory.update import fuse
-from torchfovea.perception import Observer, new_memory
+from torchfovea.perception import new_memory
 from torchfovea.rows import to_device
 from torchfovea.sensing.chart import basis
 from torchfovea.sensing.triangulation import Observations, observe
@@ -33,11 +32,6 @@ _LOOPED, _FORCED = 100, 1000  # receptive fields that the slow peers go through
 
 def _observe(look: Saccade, support: Tensor) -> Observations:
     return observe(look.matches, look.pose, look.observer.camera, support)
-
-
-def _compiled(observer: Observer, look: Saccade, support: Tensor) -> Observations:
-    with compiling(observer.compile):
-        return _observe(look, support)
 
 
 def _triangulate(look: Saccade) -> Path:
@@ -75,12 +69,8 @@ def _triangulate(look: Saccade) -> Path:
         partial(_observe, look, support),
         (
             Peer("batched torch, whole matrices", partial(peers.unscented, torch, px, sigma, tensors, points)),
-            Peer(
-                f"filterpy loop, {len(some)} of them scaled",
-                loop,
-                count / len(some),
-            ),
-            *compiled_peer(look, lambda quick: _compiled(quick, look, support)),
+            Peer(f"filterpy loop, {len(some)} of them scaled", loop, count / len(some)),
+            *compiled_peer(look.compile, lambda mode: partial(within, mode, _observe, look, support)),
         ),
         check,
         nbytes(look.matches, support, _observe(look, support)),

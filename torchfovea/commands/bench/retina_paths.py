@@ -13,8 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchfovea.commands.bench.timing import Growth, Path, Peer, nbytes, same
-from torchfovea.compiling import compiling
+from torchfovea.commands.bench.timing import Growth, Path, Peer, compiled_peer, nbytes, same, within
 from torchfovea.sensing.layout import LogPolar
 from torchfovea.sensing.retina import fovea
 
@@ -106,8 +105,8 @@ def path_of_retina(retina: LogPolar, size: int, batch: int, device: str, compile
     kernel = torch.tensor([1.0, 3, 3, 1], device=device) / 8
     kernel = (kernel[:, None] * kernel).expand(3, 1, 4, 4).contiguous()
     plan = _plan(retina, size)
-    paths = []
-    for pictures in (1, batch):
+
+    def path(pictures: int) -> Path:
         image = _picture(size).expand(pictures, -1, -1, -1).contiguous().to(device)
         arrays = [np.ascontiguousarray(one.permute(1, 2, 0).cpu().numpy()) for one in image]
         places = [
@@ -118,28 +117,22 @@ def path_of_retina(retina: LogPolar, size: int, batch: int, device: str, compile
         opencv = Peer("cv2: pyramid, remap", partial(_all_by_opencv, arrays, plan, retina.count))
         kornia = Peer("kornia: pyramid, remap", partial(_by_kornia, image, plan, places, kernel))
         ours = partial(fovea, image, None, retina)
-        fast = () if compile == "off" else (Peer("ours, compiled", partial(_compiled, ours, compile)),)
+        fast = compiled_peer(compile, lambda mode: partial(within, mode, ours))
         sizes = tuple(retina.count // share for share in (4, 2, 1))
         runs = tuple(partial(fovea, image, None, LogPolar(count)) for count in sizes)
-        paths.append(
-            Path(
-                "retina",
-                f"{pictures} of 3 x {size} x {size} by {retina.count} RFs",
-                device,
-                ours,
-                (*((opencv, kornia) if device == "cpu" else (kornia, opencv)), *fast),
-                partial(_check, ours, opencv.run, kornia.run),
-                nbytes(image, ours()),
-                (Growth("RFs", sizes, runs),) if pictures == 1 else (),
-                pictures,
-            )
+        return Path(
+            "retina",
+            f"{pictures} of 3 x {size} x {size} by {retina.count} RFs",
+            device,
+            ours,
+            (*((opencv, kornia) if device == "cpu" else (kornia, opencv)), *fast),
+            partial(_check, ours, opencv.run, kornia.run),
+            nbytes(image, ours()),
+            (Growth("RFs", sizes, runs),) if pictures == 1 else (),
+            pictures,
         )
-    return paths
 
-
-def _compiled(work: Callable[[], Any], mode: str) -> Any:
-    with compiling(mode):
-        return work()
+    return [path(1), path(batch)]
 
 
 def _all_by_opencv(images: list[np.ndarray], plan: list[_Level], count: int) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -14,19 +15,19 @@ from torchfovea.commands.bench import peers
 from torchfovea.commands.bench.look import (
     Saccade,
     batch_of,
-    compiled_peer,
     flat_of,
     part_of,
     saccade,
     shares,
     support_of,
 )
-from torchfovea.commands.bench.timing import Growth, Path, Peer, nbytes, same
+from torchfovea.commands.bench.timing import Growth, Path, Peer, compiled_peer, nbytes, same
 from torchfovea.deciding.strategies import Strategy, upper_confidence_bound
 from torchfovea.gaussian import columns, unpack
+from torchfovea.memory.cell_index import CellIndex
 from torchfovea.memory.egosphere import Memory
-from torchfovea.perception import Observer, decide, new_memory, perceive
-from torchfovea.rows import to_device
+from torchfovea.perception import Observer, compiled, decide, new_memory, perceive
+from torchfovea.rows import each, to_device
 from torchfovea.sensing.triangulation import observe
 from torchfovea.sensing.unscented import SigmaPoints
 
@@ -76,18 +77,13 @@ def _decide(look: Saccade) -> Path:
     sizes = shares(memory.cells.shape[0])
 
     def part(size: int) -> Any:
-        less = memory._replace(
-            cells=columns(*memory.cells[:size].unbind(-1)),
-            information=type(memory.information)(*(columns(*p[:size].unbind(-1)) for p in memory.information)),
-            bearing=memory.bearing[:size],
-            looks=memory.looks[:size],
-            lasting=columns(*memory.lasting[:size].unbind(-1)),
-            votes=columns(*memory.votes[:size].unbind(-1)),
-        )
+        less = each(lambda p: p[:size] if p.dim() == 1 else columns(*p[:size].unbind(-1)), memory, (CellIndex,))
         return partial(choose, less)
 
     done = ours()
-    fast = compiled_peer(look, lambda quick: decide(quick, memory, strategy=_strategy(look)))
+    fast = compiled_peer(
+        look.compile, lambda mode: partial(decide, compiled(observer, mode), memory, strategy=_strategy(look))
+    )
     return Path(
         "decide",
         f"{len(memory.cells)} cells",
@@ -105,8 +101,8 @@ def _one_step(look: Saccade) -> Any:
     return decide(look.observer, memory, strategy=_strategy(look))
 
 
-def _step_by(look: Saccade, observer: Observer) -> Any:
-    return _one_step(look._replace(observer=observer))
+def _compiled_step(look: Saccade, mode: str) -> Callable[[], Any]:
+    return partial(_one_step, look._replace(observer=compiled(look.observer, mode)))
 
 
 def _step(look: Saccade, full: Observer) -> list[Path]:
@@ -143,7 +139,7 @@ def _step(look: Saccade, full: Observer) -> list[Path]:
         Growth("cells", cell_sizes, by_cells),
     )
     whole = look._replace(observer=full)
-    fast, fast_whole = (compiled_peer(one, partial(_step_by, one)) for one in (look, whole))
+    fast, fast_whole = (compiled_peer(one.compile, partial(_compiled_step, one)) for one in (look, whole))
     moved = nbytes(look.matches, memory, done.memory, done.points, done.reward, done.eligible)
     return [
         Path("step", work, device, ours, (Peer("NumPy and SciPy, vectorized", theirs), *fast), check, moved, growths),

@@ -10,7 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-__all__ = ["Growth", "Path", "Peer", "Timing", "copy_bandwidth", "interleaved", "nbytes", "same", "slope"]
+from torchfovea.compiling import compiling
+
+__all__ = [
+    "Growth", "Path", "Peer", "Timing", "compiled_peer", "copy_bandwidth", "interleaved", "nbytes", "same", "slope",
+    "within",
+]  # fmt: skip
 
 _FEWEST, _MOST = 3, 400  # rounds
 _REST_S = 0.02  # before each: threads of what ran last (BLAS, OpenMP) spin on for a while
@@ -79,6 +84,26 @@ class Path(NamedTuple):
     moved: int = 0
     growths: tuple[Growth, ...] = ()
     units: int = 1
+
+
+def within(mode: str, work: Callable[..., Any], *args: Any) -> Any:
+    """What a function gives where kernels run compiled, see `torchfovea.compiling`."""
+    with compiling(mode):
+        return work(*args)
+
+
+def compiled_peer(mode: str, make: Callable[[str], Callable[[], Any]]) -> tuple[Peer, ...]:
+    """The same work compiled, and called once for that; none where the mode is off.
+
+    Args:
+        mode: see `torchfovea.compiling`.
+        make: what does the work in a mode.
+    """
+    if mode == "off":
+        return ()
+    quick = make(mode)
+    quick()
+    return (Peer("ours, compiled", quick),)
 
 
 def nbytes(*parts: Any) -> int:

@@ -19,6 +19,7 @@ from torchfovea.commands.shared.build import (
 )
 from torchfovea.commands.shared.parallel import spread, workers_of
 from torchfovea.commands.shared.screen import progress_bar
+from torchfovea.commands.shared.settings import changed
 from torchfovea.sensing.correspondence import Budget
 from torchfovea.sensing.head import Gaze, fixate
 from torchfovea.setting import SettingError
@@ -84,9 +85,7 @@ def looks_at(task: SceneTask) -> list[Truths]:
 
 def viewed(cfg: DictConfig, fov_deg: float) -> DictConfig:
     """The same settings with another field of view."""
-    changed = cfg.copy()
-    changed.sensor.fov_deg = fov_deg
-    return changed
+    return changed(cfg, {"sensor": {"fov_deg": fov_deg}})
 
 
 def random_gazes(scene: Scene, world: World, count: int, generator: torch.Generator) -> list[Gaze]:
