@@ -29,7 +29,7 @@ from torchfovea.sensing.correspondence import Budget, Correspondences
 from torchfovea.sensing.head import Eyes, Gaze, Head, Kinematics, cyclopean, fixate
 from torchfovea.sensing.kinship import kinship
 from torchfovea.sensing.layout import LogPolar, Retina
-from torchfovea.sensing.triangulation import observe
+from torchfovea.sensing.triangulation import Observations, observe
 from torchfovea.sensing.unscented import SigmaPoints
 from torchfovea.setting import check_types, require
 
@@ -44,6 +44,7 @@ __all__ = [
     "decide",
     "gaze_at",
     "new_memory",
+    "observed",
     "perceive",
 ]
 
@@ -178,6 +179,16 @@ def check_owner(observer: Observer, memory: Memory) -> None:
     require(asked in (0, known), "classes", asked, f"{known}, the classes of the memory")
 
 
+def observed(observer: Observer, matches: Correspondences, eyes: Eyes) -> Observations:
+    """Correspondences (..., N) as Gaussians in the memory's chart, by the observer's cameras, retina and sigma points.
+
+    Differentiable, see `torchfovea.sensing.triangulation.observe`.
+    """
+    support = matches.supported(observer.retina)
+    chart = observer.fusion.chart
+    return observe(matches, eyes, observer.cameras, support, observer.points, chart, observer.rotated)
+
+
 @unrounded
 def perceive(
     observer: Observer, memory: Memory, matches: Correspondences, eyes: Eyes, common: Common | None = None
@@ -199,10 +210,8 @@ def perceive(
         SettingError: for a memory of another chart or prior than the observer's.
     """
     check_owner(observer, memory)
-    support = observer.retina.width_px(matches.left_px) / 2 if matches.support_px is None else matches.support_px
-    seen = matches, eyes, observer.cameras, support, observer.points, observer.fusion.chart, observer.rotated
     with compiling(observer.compile):
-        observed = observe(*seen)
+        seen = observed(observer, matches, eyes)
     sigma = math.radians(observer.head.encoder_deg)
     if common is None and sigma > 0:
         common = partial(encoder_covariance, eyes=eyes, sigma_rad=(sigma,) * 3, chart=observer.fusion.chart)
@@ -213,7 +222,7 @@ def perceive(
         same = torch.exp(-(((axis - memory.axis).norm(dim=-1, keepdim=True) / math.radians(SAME_GAZE_DEG)).square()))
         kin = kin._replace(lasting=kin.lasting + (kin.shared - kin.lasting).clamp(min=0) * same)
     with compiling(observer.compile):
-        after = remember(memory, observed, observer.fusion, common, kin, matches.classes)
+        after = remember(memory, seen, observer.fusion, common, kin, matches.classes)
     if observer.fusion.votes:
         missed = within_sight(memory, after.looks == memory.looks, eyes, observer.cameras, observer.retina)
         after = after._replace(votes=against(after.votes, missed))

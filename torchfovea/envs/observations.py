@@ -13,13 +13,12 @@ from torch import Tensor
 from torchfovea.envs.rows import SearchRows
 from torchfovea.envs.settings import EnvSettings
 from torchfovea.memory.egosphere import trust
-from torchfovea.perception import Observer
+from torchfovea.perception import Observer, observed
 from torchfovea.rows import row
 from torchfovea.search import Look
 from torchfovea.sensing.head import Gaze, Head, cyclopean, eyes
 from torchfovea.sensing.layout import LogPolar, cortical
 from torchfovea.sensing.retina import fovea
-from torchfovea.sensing.triangulation import observe
 from torchfovea.setting import require
 
 __all__ = ["CHANNELS", "Shown", "map_index", "memory_map", "observation_space", "observations", "shown_of"]
@@ -144,8 +143,7 @@ def _sensed(name: str, rows: SearchRows, look: Look | None, k: int, gaze: Gaze) 
         return cortical(fovea(images, None, observer.retina)[0], observer.retina).clamp(0, 1)
     matches = row(look.matches, k)
     pose = eyes(observer.head, Gaze(*(angle[k] for angle in gaze)))
-    support = observer.retina.width_px(matches.left_px) / 2 if matches.support_px is None else matches.support_px
-    seen = observe(matches, pose, observer.camera, support, observer.points, observer.fusion.chart, observer.rotated)
+    seen = observed(observer, matches, pose)
     sure = torch.ones_like(seen.support_rad) if seen.inlier is None else seen.inlier
     values = torch.cat([seen.mean, seen.cov, sure[..., None]], -1)
     return torch.where(seen.valid[..., None], values, 0.0).nan_to_num().clamp(-_MOST, _MOST)

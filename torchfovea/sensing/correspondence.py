@@ -60,6 +60,10 @@ class Correspondences(NamedTuple):
         more = (None if part is None else part[index] for part in self[5:])
         return Correspondences(left_px, right_px, left_sigma, right_sigma, valid, *more)
 
+    def supported(self, retina: Retina) -> Tensor:
+        """`support_px` (..., N), the RFs' own where it is not told."""
+        return retina.width_px(self.left_px) / 2 if self.support_px is None else self.support_px
+
 
 def check_valid(matches: Correspondences) -> None:
     """Raise SettingError for what are no correspondences, or say by numbers which are valid."""

@@ -27,6 +27,5 @@ def for_all(matches: Correspondences, retina: Retina) -> Correspondences:
 
     Before any are dropped: what is missing then counts as not looked through.
     """
-    support = retina.width_px(matches.left_px) / 2 if matches.support_px is None else matches.support_px
     share = retina.count / max(1, matches.valid.shape[-1])
-    return matches._replace(support_px=support * math.sqrt(max(1.0, share)))
+    return matches._replace(support_px=matches.supported(retina) * math.sqrt(max(1.0, share)))

@@ -10,10 +10,9 @@ from omegaconf import DictConfig
 from torchfovea.commands.shared.build import build_arena, build_observer, name_of
 from torchfovea.commands.shared.precision import EGO, Dots, bearings_deg, both_sensors, headline, measured
 from torchfovea.gaussian import Gaussian, columns
-from torchfovea.perception import Observer
+from torchfovea.perception import Observer, observed
 from torchfovea.sensing.chart import cartesian_from_inverse_range
 from torchfovea.sensing.head import Eyes, Gaze, eyes
-from torchfovea.sensing.triangulation import observe
 from torchfovea.setting import require
 from torchfovea.sim.world import World
 
@@ -56,13 +55,11 @@ def draw_scene(path: Path, sensors: Sensors, seed: int, gaze: Gaze) -> None:
         arena = build_arena(cfg, observer, seed)
         believed = Gaze(*(angle.float() for angle in arena.saccade(gaze).gaze))
         matches = arena.look(believed, torch.Generator().manual_seed(seed)).matches
-        width = observer.retina.width_px(matches.left_px)
-        support = width / 2 if matches.support_px is None else matches.support_px
         pose = eyes(observer.head, believed)
-        chart = observer.fusion.chart
-        seen = observe(matches, pose, observer.cameras, support, observer.points, chart, observer.rotated)
+        seen = observed(observer, matches, pose)
         points = Gaussian(seen.mean, seen.cov)
-        points = cartesian_from_inverse_range(points, seen.direction) if chart == "inverse_range" else points
+        if observer.fusion.chart == "inverse_range":
+            points = cartesian_from_inverse_range(points, seen.direction)
         clouds.append(measured(headline(name, observer.retina), pose, points, seen.valid, seen.inlier))
         true = true or _true(arena.world, pose)
     assert true is not None
