@@ -176,12 +176,6 @@ def inverse_range_acuity(
     return law
 
 
-class _Foresight(NamedTuple):
-    """State of `information_gain`: the precision that each fixation would bring each cell, (..., N, N)."""
-
-    precision: Tensor
-
-
 def information_gain(
     view: View,
     law: Callable[[Tensor], Tensor],
@@ -189,8 +183,10 @@ def information_gain(
     in_range: bool = False,
     overhead: float | None = None,
     unit: str = "degrees",
-) -> tuple[Tensor, _Foresight]:
+) -> tuple[Tensor, Tensor]:
     """Expected information of a fixation under the sensor model, one step ahead (Najemnik and Geisler 2005).
+
+    Its state is the precision that each fixation would bring each cell, (..., N, N).
 
     Args:
         view: what is known.
@@ -203,8 +199,8 @@ def information_gain(
     belief = RewardBelief(view.mean, view.std)
     if in_range:
         belief = inverse_range_from_range(belief)
-    state = view.state
-    if state is None:
+    precision = view.state
+    if precision is None:
         angles = torch.linspace(0, half_view_rad, 512, dtype=view.mean.dtype, device=view.mean.device)
         table = 1 / law(angles).square()
 
@@ -212,11 +208,11 @@ def information_gain(
             place = (angle / half_view_rad * 511).clamp(0, 511)
             return table[place.round().long()].rsqrt()
 
-        state = _Foresight(infomax.precision_by_eccentricity(view.directions, view.directions, sigma, half_view_rad))
-    gain = infomax.information_gain(belief.std.square(), state.precision, view.eligible)
+        precision = infomax.precision_by_eccentricity(view.directions, view.directions, sigma, half_view_rad)
+    gain = infomax.information_gain(belief.std.square(), precision, view.eligible)
     if overhead is not None:
         gain = infomax.per_cost(gain, _cost(view, unit), overhead)
-    return gain, state
+    return gain, precision
 
 
 class _Course(NamedTuple):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 from typing import Any, Protocol
 
 import torch
@@ -171,10 +170,7 @@ class RobotPlaces:
     def __init__(self, robots: Sequence[Robot], observer: Observer, cells: Tensor) -> None:
         self.robots: list[Any] = list(robots)
         self.observer, self.cells = observer, cells
-
-    @cached_property
-    def _truths(self) -> dict[int, Truth | None]:
-        return {}
+        self._truths: dict[int, Truth | None] = {}
 
     def renew(self, rows: Sequence[int], scenes: Sequence[int], seeds: Sequence[int]) -> None:
         """A robot may have a `reset(seed)` of its own."""

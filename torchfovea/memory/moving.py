@@ -76,8 +76,11 @@ def motion(rotation: Tensor, translation: Tensor, covariance: Tensor | None = No
     return Motion(r, t, c)
 
 
-def _without_classes(memory: Memory) -> None:
+def _check_one(memory: Memory, fusion: Fusion) -> None:
+    """Refuse what can be neither moved nor resampled: beliefs of classes, batches, and a fusion of another chart."""
     require(memory.classes is None, "memory.classes", "a belief of classes", "none: it is neither moved nor resampled")
+    check_chart(memory, fusion.chart, "fusion.chart")
+    require(memory.cells.dim() == 2, "cells", tuple(memory.cells.shape), "one memory, a shape (cells, 3)")
 
 
 def _frame(direction: Tensor) -> Tensor:
@@ -165,8 +168,8 @@ def move(memory: Memory, step: Motion, fusion: Fusion) -> Memory:
     Each seen cell's point or patch is moved with its covariance (the rotation exactly, the odometry's covariance added)
     and finds its new cell. Of several in one cell those that a nearer one hides are left out, and of the rest the one
     closest to the cell's direction stays *alone*: neighbours share the odometry's error, so that their sum would claim
-    too much. A cell that got
-    nothing takes the nearest patch within 1.5 spacings. Cells that nothing moved into are unseen.
+    too much. A cell that got nothing takes the nearest patch within 1.5 spacings. Cells that nothing moved into are
+    unseen.
 
     Args:
         memory: before, (Nx, 3).
@@ -180,9 +183,7 @@ def move(memory: Memory, step: Motion, fusion: Fusion) -> Memory:
         SettingError: for a batch of memories, or a fusion of another chart.
     """
     require(isinstance(step, Motion), "step", type(step).__name__, "a torchfovea.Motion, made by motion")
-    _without_classes(memory)
-    check_chart(memory, fusion.chart, "fusion.chart")
-    require(memory.cells.dim() == 2, "cells", tuple(memory.cells.shape), "one memory, a shape (cells, 3)")
+    _check_one(memory, fusion)
     cells, spacing_rad = memory.cells, memory.spacing_rad
     moved, empty = _carry(memory, step), _emptied(memory)
     if memory.axis is not None:
@@ -274,9 +275,7 @@ def resample(memory: Memory, cells: Tensor, fusion: Fusion) -> Memory:
     Raises:
         SettingError: for a batch of memories, cells that are not unit directions or a fusion of another chart.
     """
-    _without_classes(memory)
-    check_chart(memory, fusion.chart, "fusion.chart")
-    require(memory.cells.dim() == 2, "cells", tuple(memory.cells.shape), "one memory, a shape (cells, 3)")
+    _check_one(memory, fusion)
     chart, prior, spacing_rad = memory.chart, memory.prior, memory.spacing_rad
     require(cells.dim() == 2, "cells", tuple(cells.shape), "directions of one memory, a shape (cells, 3)")
     cells = cells.to(memory.cells.dtype) if cells.dtype in (torch.float32, torch.float64) else cells

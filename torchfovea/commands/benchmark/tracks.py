@@ -19,7 +19,7 @@ from torchfovea.commands.shared.build import build_arena, build_cells, build_mat
 from torchfovea.commands.shared.composed import compose_search
 from torchfovea.commands.shared.figures import EPISODE_COLUMNS, episode_row
 from torchfovea.commands.shared.judge import estimate, fixation_course, judge_cells
-from torchfovea.commands.shared.regions import REGIONS, regions
+from torchfovea.commands.shared.regions import REGIONS, at_places, regions
 from torchfovea.commands.shared.rollout import one_episode, roll_out
 from torchfovea.commands.shared.strategy import build_strategy
 from torchfovea.deciding.strategies import Strategy, View
@@ -180,11 +180,9 @@ def _matcher(unit: Unit) -> list[Row]:
             seen = world.correspond(gaze, observer.camera.rays(matches.left_px))
             shift = world.image_camera.focal_px * observer.head.baseline_m / left.range_m
             around = regions(shift, left.image, torch.zeros_like(left.geom, dtype=torch.bool))
-            place = (
-                (matches.left_px * world.source_px / (2 * retina.radius_px) + (world.source_px - 1) / 2).round().long()
-            )
-            column, line = place.clamp(0, world.source_px - 1).unbind(-1)
-            parts.append(_judge_matches(arena, matches, gaze, seen.points_e, seen.hit, around[line, column]))
+            places = matches.left_px * world.source_px / (2 * retina.radius_px) + (world.source_px - 1) / 2
+            here = at_places(around, places)
+            parts.append(_judge_matches(arena, matches, gaze, seen.points_e, seen.hit, here))
         told = [torch.cat(part) for part in zip(*parts, strict=True)]
         rows.append({"seed": seed, **_match_figures(told), "compute_seconds": took / LOOKS})
     return rows

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.commands.shared.pairs import Pair
-from torchfovea.commands.shared.regions import REGIONS, regions, truth_step_px
+from torchfovea.commands.shared.regions import REGIONS, at_places, regions, truth_step_px
 from torchfovea.sensing.camera import Camera
 from torchfovea.sensing.correspondence import Budget, Correspondences
 from torchfovea.sensing.head import Eyes, Gaze, eyes
@@ -59,7 +59,7 @@ def look_at_world(world: World, gaze: Gaze, retina: Retina, budget: Budget, matc
     shift = world.image_camera.focal_px * world.head.baseline_m / left.range_m
     around = regions(shift, left.image, torch.zeros_like(left.geom, dtype=torch.bool))
     scale = world.source_px / (2 * retina.radius_px)
-    region = _at(around, matches.left_px * scale + (world.source_px - 1) / 2)
+    region = at_places(around, matches.left_px * scale + (world.source_px - 1) / 2)
     region = torch.where(seen.hit & ~seen.visible_right, REGIONS.index("hidden"), region)
     data, which = judged(matches, pose, world.camera, retina, budget, truth, found.clues, region=region)
     return _told(
@@ -87,7 +87,8 @@ def look_at_pair(
     truth = _inverse_range(true, left, right, pair.baseline_m)
     known = true.valid
     truth = torch.where(known, truth, torch.zeros_like(truth))
-    region = _at(regions(pair.disparity, pair.left), matches.left_px * scale + true.left_px.new_tensor(views.gaze_px))
+    places = matches.left_px * scale + true.left_px.new_tensor(views.gaze_px)
+    region = at_places(regions(pair.disparity, pair.left), places)
     data, which = judged(matches, pose, (left, right), retina, budget, truth, found.clues, region=region)
     ray = torch.nn.functional.normalize(left.rays(matches.left_px), dim=-1)
     points = ray / torch.where(known, truth, torch.ones_like(truth))[:, None]
@@ -119,13 +120,6 @@ def _told(
 def _shares(valid: Tensor, among: Tensor, area: Tensor) -> tuple[float, float]:
     by_field, by_area = (float((w * (valid & among)).sum() / (w * among).sum()) for w in (torch.ones_like(area), area))
     return by_field, by_area
-
-
-def _at(values: Tensor, place: Tensor) -> Tensor:
-    """A map (H, W) at the pixels nearest to places (N, 2)."""
-    height, width = values.shape
-    column, row = place.round().long().unbind(-1)
-    return values[row.clamp(0, height - 1), column.clamp(0, width - 1)]
 
 
 def _inverse_range(matches: Correspondences, left: Camera, right: Camera, baseline_m: float) -> Tensor:

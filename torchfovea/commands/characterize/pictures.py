@@ -63,15 +63,11 @@ def _nats(grid: Characterization) -> np.ndarray:
     return np.where(np.asarray(grid.matched_fraction) > 0, np.asarray(grid.information), np.nan)
 
 
-def _picks(count: int, wanted: int) -> list[int]:
-    return sorted({round(i) for i in np.linspace(0, count - 1, min(wanted, count))})
-
-
 def _curves(axes: Axes, grids: Mapping[str, Characterization], over: str) -> None:
     first = next(iter(grids.values()))
     distance, vergence = np.asarray(first.distance_m), np.rad2deg(np.asarray(first.vergence_rad))
     x, rows, label = (distance, vergence, "{:.0f}°") if over == "distance" else (vergence, distance, "{:.2g} m")
-    picks = _picks(len(rows), 6)
+    picks = sorted({round(i) for i in np.linspace(0, len(rows) - 1, min(6, len(rows)))})
     colours = matplotlib.colormaps["viridis"](np.linspace(0, 0.9, len(picks)))
     for sensor, grid in grids.items():
         nats = _nats(grid) if over == "vergence" else _nats(grid).T

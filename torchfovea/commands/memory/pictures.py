@@ -8,7 +8,7 @@ import matplotlib
 import torch
 from torch import Tensor
 
-from torchfovea.commands.shared.pictures import sphere_map
+from torchfovea.commands.shared.pictures import azimuth_elevation, inner_limits, sphere_map
 from torchfovea.files import write_figure
 
 matplotlib.use("Agg")
@@ -35,10 +35,7 @@ def draw_memory(path: Path, cells: Tensor, spacing_deg: Tensor, target: Tensor, 
     up = torch.linalg.cross(ahead, side)
     # the viewer looks at the front of the sphere from outside: the robot's left is on the right
     size = float(min(6.0, max(0.5, 300 / len(cells) ** 0.5)))
-    low, high = (
-        float(q) for q in torch.quantile(spacing_deg.double(), torch.tensor([0.02, 0.98], dtype=torch.float64))
-    )
-    limits = (low, max(high, low + 1e-6))
+    limits = inner_limits(spacing_deg, 1e-6)
     front = cells @ ahead > 0
     ball = torch.linspace(0, 2 * torch.pi, 200)
     left.plot(ball.cos(), ball.sin(), color="0.6", lw=1)
@@ -49,7 +46,6 @@ def draw_memory(path: Path, cells: Tensor, spacing_deg: Tensor, target: Tensor, 
     left.set(title="the sphere from ahead; the target in red", aspect="equal")
     left.set_axis_off()
     sphere_map(right, cells, spacing_deg, "distance to the neighbours [°]", "viridis_r", limits, size)
-    azimuth, elevation = torch.atan2(target[1], target[0]).rad2deg(), target[2].asin().rad2deg()
-    right.plot(float(azimuth), float(elevation), "o", mfc="none", mec="crimson", ms=14, mew=2)
+    right.plot(*map(float, azimuth_elevation(target)), "o", mfc="none", mec="crimson", ms=14, mew=2)
     right.set_title("cells within the head's reach; the target in red")
     write_figure(path, figure, dpi=100)

@@ -14,6 +14,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 from torchfovea.commands.shared.build import build_observer, whole
 from torchfovea.commands.shared.composed import compose_search
+from torchfovea.commands.shared.figures import EPISODE_COLUMNS, episode_row
 from torchfovea.commands.shared.rollout import batched, one_episode, roll_out
 from torchfovea.deciding.strategies import upper_confidence_bound
 from torchfovea.episode import Episode
@@ -59,9 +60,9 @@ def task_name(task: CellTask) -> str:
     return "-".join([*words, arm, f"{task.seeds[0]}", hashlib.sha256(text.encode()).hexdigest()[:10]])
 
 
-def regret_convergence(regret: torch.Tensor, share: float = 0.05) -> int:
-    """The saccade (from 1) from which the regret stays within a share of its whole range of its last value."""
-    width = share * float(regret.max() - regret.min())
+def regret_convergence(regret: torch.Tensor) -> int:
+    """The saccade (from 1) from which the regret stays within 5% of its whole range of its last value."""
+    width = 0.05 * float(regret.max() - regret.min())
     outside = ((regret - regret[-1]).abs() > width).nonzero()
     return 1 if len(outside) == 0 else int(outside[-1]) + 2
 
@@ -182,13 +183,9 @@ def run_task(task: CellTask, folders: tuple[str, ...] = ()) -> list[dict[str, An
 
 
 def _row(task: CellTask, arm: str, seed: int, episode: Episode) -> dict[str, Any]:
-    local = episode.local_information
-    values = (
-        float(episode.gap[-1]), float(episode.gap.mean()), float(episode.regret.mean()),
-        float(episode.global_information.mean()), None if local is None else float(local.mean()), episode.moves,
-        int(episode.hit.any()), episode.target_error_m, episode.degrees, regret_convergence(episode.regret),
-    )  # fmt: skip
-    row = {**task.labels, "arm": arm, "seed": seed, **dict(zip(METRICS, values, strict=True))}
+    figures = dict(zip(EPISODE_COLUMNS[2:], episode_row(episode), strict=True))
+    figures["regret_convergence"] = regret_convergence(episode.regret)
+    row = {**task.labels, "arm": arm, "seed": seed, **{name: figures[name] for name in METRICS}}
     if arm in task.curves:
         course = {name: getattr(episode, name) for name in CURVES}
         row["curves"] = {k: None if c is None else [round(float(v), 5) for v in c] for k, c in course.items()}

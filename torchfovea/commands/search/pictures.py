@@ -9,7 +9,7 @@ import matplotlib
 import numpy as np
 import torch
 
-from torchfovea.commands.shared.pictures import azimuth_elevation, found_map, sphere_map
+from torchfovea.commands.shared.pictures import azimuth_elevation, found_map, inner_limits, sphere_map
 from torchfovea.episode import Episode
 from torchfovea.files import write_figure
 from torchfovea.metrics import information
@@ -169,8 +169,7 @@ def draw_episode(path: Path, episode: Episode, retina: Retina, title: str, scene
     distance = torch.where(seen, points.mean.norm(dim=-1), torch.nan)
     nats = information(points.cov)
     sphere_map(row[0], memory.cells, distance, "range [m]", "viridis_r", (0.4, 4.0))
-    low, high = (float(q) for q in torch.quantile(nats.double(), torch.tensor([0.02, 0.98], dtype=torch.float64)))
-    sphere_map(row[1], memory.cells, nats, "information [nats]", "magma", (low, max(high, low + 1e-3)))
+    sphere_map(row[1], memory.cells, nats, "information [nats]", "magma", inner_limits(nats))
     for axes, name in zip(row, ("range, and the fixations in order", "information"), strict=True):
         axes.set_title(f"memory: {name}")
         axes.set_facecolor("0.9")

@@ -7,10 +7,9 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-import torch
 from torch import Tensor
 
-from torchfovea.commands.shared.pictures import found_map
+from torchfovea.commands.shared.pictures import found_map, inner_limits
 from torchfovea.files import write_figure
 from torchfovea.sensing.correspondence import Disparity
 from torchfovea.sensing.layout import Retina
@@ -57,11 +56,7 @@ def draw_sense(path: Path, left: Tensor, found: Any, retina: Retina | None, obse
         (sigma / rho, "how surely it is known", "relative standard deviation of inverse range", "magma", True),
     )
     for place, (value, name, label, cmap, log) in zip(axes[1], maps, strict=True):
-        low, high = (
-            (float(q) for q in torch.quantile(value.double(), torch.tensor([0.02, 0.98], dtype=torch.float64)))
-            if len(value)
-            else (0.1, 1.0)
-        )
+        low, high = inner_limits(value, 0.0) if len(value) else (0.1, 1.0)
         drawn = place.scatter(
             *px[keep].T, c=value, s=1.5, cmap=cmap, linewidths=0, norm="log" if log else None, rasterized=True
         )

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.commands.shared.pairs import Pair
-from torchfovea.commands.shared.regions import hidden_places
+from torchfovea.commands.shared.regions import at_places, hidden_places
 from torchfovea.gaussian import Gaussian, columns
 from torchfovea.sensing.layout import Retina
 from torchfovea.sensing.triangulation import Observations
@@ -52,7 +52,8 @@ def match_figures(
     depth = pair.depth_m(read_at_fields(pair.disparity, views, retina))
     length = views.cameras(retina)[0].rays(px).norm(dim=-1)
     seen = ~hidden_places(pair.disparity) if pair.seen is None else pair.seen
-    known, hidden = torch.isfinite(depth), ~_at_fields(seen, views, retina, px)
+    places = px * views.scale(retina) + px.new_tensor(views.origin_px(retina))
+    known, hidden = torch.isfinite(depth), ~at_places(seen, places)
     error = observed.mean[:, 2] - 1 / (depth * length)
     z = (error / observed.cov[:, 5].sqrt()).abs()
     miss = (points.mean[:, 2] - depth).abs()
@@ -104,13 +105,6 @@ def image_seen(views: Views, retina: Retina | None) -> float:
     place = columns(*torch.broadcast_tensors(column, row[:, None]))
     there = (place - place.new_tensor(views.origin_px(retina))) / views.scale(retina)
     return float(retina.inside(there).double().mean())
-
-
-def _at_fields(mask: Tensor, views: Views, retina: Retina | None, px: Tensor) -> Tensor:
-    """A mask (H, W) at the receptive fields, bool (N,); the nearest border's beyond the image."""
-    height, width = mask.shape
-    place = (px * views.scale(retina) + px.new_tensor(views.origin_px(retina))).round().long()
-    return mask[place[:, 1].clamp(0, height - 1), place[:, 0].clamp(0, width - 1)]
 
 
 def _mean(values: Tensor, weight: Tensor) -> float:

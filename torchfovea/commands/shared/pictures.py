@@ -26,7 +26,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import MaxNLocator
 
-__all__ = ["PALETTE", "azimuth_elevation", "draw_glance", "draw_precision", "found_map", "sphere_map"]
+__all__ = ["PALETTE", "azimuth_elevation", "draw_glance", "draw_precision", "found_map", "inner_limits", "sphere_map"]
 
 # after Okabe and Ito: told apart by every eye
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#E69F00", "#56B4E9", "#CC79A7", "#000000")
@@ -56,6 +56,12 @@ def azimuth_elevation(directions: Tensor) -> tuple[Tensor, Tensor]:
     """Where unit directions (..., 3) in E lie on a sphere map [degrees]."""
     x, y, z = directions.unbind(-1)
     return torch.rad2deg(torch.atan2(y, x)), torch.rad2deg(torch.asin(z.clamp(-1, 1)))
+
+
+def inner_limits(values: Tensor, apart: float = 1e-3) -> tuple[float, float]:
+    """The ends of a colour scale: between them lie all values but 2% at either side; at least so far apart."""
+    low, high = torch.quantile(values.double(), torch.tensor([0.02, 0.98], dtype=torch.float64)).tolist()
+    return low, max(high, low + apart)
 
 
 def sphere_map(
@@ -101,8 +107,7 @@ def draw_glance(glance: Glance, path: Tensor, nats: Sequence[float], retina: Ret
     distance = torch.where(memory.looks > 0, points.mean.norm(dim=-1), torch.nan)
     sphere_map(wide[0], memory.cells, distance.cpu(), "range [m]", "viridis_r", (0.4, 4.0))
     known = information(points.cov).cpu()
-    low, high = (float(q) for q in torch.quantile(known.double(), known.new_tensor([0.02, 0.98]).double()))
-    sphere_map(wide[1], memory.cells, known, "information [nats]", "magma", (low, max(high, low + 1e-3)))
+    sphere_map(wide[1], memory.cells, known, "information [nats]", "magma", inner_limits(known))
     for axes, name in zip(wide, ("range of the seen cells", "information"), strict=False):
         axes.set_title(name)
         axes.set_facecolor("0.9")

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["REGIONS", "hidden_places", "regions", "truth_step_px"]
+__all__ = ["REGIONS", "at_places", "hidden_places", "regions", "truth_step_px"]
 
 REGIONS = ("smooth", "edge", "hidden", "weak_texture")
 """Every place is one of these: hidden before edge before weak texture before smooth."""
@@ -58,6 +58,13 @@ def hidden_places(disparity: Tensor) -> Tensor:
     for beside in (-1, 0, 1):  # a surface that slants is stretched in the right image
         nearest.scatter_reduce_(1, column + beside, told, "amax")
     return known & (nearest.gather(1, column) > shift + EDGE_STEP_PX)
+
+
+def at_places(values: Tensor, places: Tensor) -> Tensor:
+    """A map (H, W) at the pixels nearest to places (N, 2), columns and rows; the border's beyond it."""
+    height, width = values.shape
+    column, row = places.round().long().unbind(-1)
+    return values[row.clamp(0, height - 1), column.clamp(0, width - 1)]
 
 
 def truth_step_px(disparity: Tensor) -> float:

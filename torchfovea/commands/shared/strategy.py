@@ -18,7 +18,7 @@ from torchfovea.deciding.strategies import Strategy, View
 from torchfovea.deciding.weighted import Weighting
 from torchfovea.perception import Observer
 from torchfovea.search import StopRule
-from torchfovea.setting import require
+from torchfovea.setting import require, typed
 
 __all__ = [
     "build_stop",
@@ -85,7 +85,7 @@ def _checked(strategy: Strategy, name: str) -> Strategy:
 
 
 def _number(value: float, setting: str, expected: str, least: float = 0.0) -> float:
-    require(value >= least, f"acquisition.{setting}", value, expected)
+    require(typed(value, "float", f"acquisition.{setting}") >= least, f"acquisition.{setting}", value, expected)
     return float(value)
 
 
