@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchfovea.commands.bench import peers
 from torchfovea.commands.bench.look import Saccade, flat_of, part_of, shares, support_of
-from torchfovea.commands.bench.timing import Growth, Path, Peer, compiled_peer, nbytes, same, within
+from torchfovea.commands.bench.timing import Growth, Path, Peer, compiled_peer, in_mode, nbytes, same
 from torchfovea.gaussian import Gaussian, columns, pack, unpack
 from torchfovea.memory.association import Pairs, associate, gather_columns
 from torchfovea.memory.egosphere import Memory, Prior, belief, empty_memory
@@ -70,7 +70,7 @@ def _triangulate(look: Saccade) -> Path:
         (
             Peer("batched torch, whole matrices", partial(peers.unscented, torch, px, sigma, tensors, points)),
             Peer(f"filterpy loop, {len(some)} of them scaled", loop, count / len(some)),
-            *compiled_peer(look.compile, lambda mode: partial(within, mode, _observe, look, support)),
+            *compiled_peer(look.compile, lambda mode: partial(in_mode, mode, _observe, look, support)),
         ),
         check,
         nbytes(look.matches, support, _observe(look, support)),

@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchfovea.commands.bench.timing import Growth, Path, Peer, compiled_peer, nbytes, same, within
+from torchfovea.commands.bench.timing import Growth, Path, Peer, compiled_peer, in_mode, nbytes, same
 from torchfovea.sensing.layout import LogPolar
 from torchfovea.sensing.retina import fovea
 
@@ -117,7 +117,7 @@ def path_of_retina(retina: LogPolar, size: int, batch: int, device: str, compile
         opencv = Peer("cv2: pyramid, remap", partial(_all_by_opencv, arrays, plan, retina.count))
         kornia = Peer("kornia: pyramid, remap", partial(_by_kornia, image, plan, places, kernel))
         ours = partial(fovea, image, None, retina)
-        fast = compiled_peer(compile, lambda mode: partial(within, mode, ours))
+        fast = compiled_peer(compile, lambda mode: partial(in_mode, mode, ours))
         sizes = tuple(retina.count // share for share in (4, 2, 1))
         runs = tuple(partial(fovea, image, None, LogPolar(count)) for count in sizes)
         return Path(

@@ -13,8 +13,8 @@ import torch
 from torchfovea.compiling import compiling
 
 __all__ = [
-    "Growth", "Path", "Peer", "Timing", "compiled_peer", "copy_bandwidth", "interleaved", "nbytes", "same", "slope",
-    "within",
+    "Growth", "Path", "Peer", "Timing", "compiled_peer", "copy_bandwidth", "in_mode", "interleaved", "nbytes", "same",
+    "slope",
 ]  # fmt: skip
 
 _FEWEST, _MOST = 3, 400  # rounds
@@ -86,7 +86,7 @@ class Path(NamedTuple):
     units: int = 1
 
 
-def within(mode: str, work: Callable[..., Any], *args: Any) -> Any:
+def in_mode(mode: str, work: Callable[..., Any], *args: Any) -> Any:
     """What a function gives where kernels run compiled, see `torchfovea.compiling`."""
     with compiling(mode):
         return work(*args)
