@@ -31,6 +31,13 @@ from torchfovea.studies.significance import bootstrap_interval
 PAGES = Path(__file__).resolve().parents[1] / "docs" / "results"
 MARKED = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 LARGEST = 20_000  # bytes of a table that is kept
+# what is kept of a table of the same name that has much more, which the run's result repeats
+COLUMNS = {
+    "honesty": (
+        "sensor", "cells", "looks", "nees_mean", "coverage_50", "coverage_95", "coverage_95_low", "coverage_95_high",
+        "outlier_share", "median_error", "mean_error",
+    ),
+}  # fmt: skip
 
 
 class Run(NamedTuple):
@@ -60,8 +67,11 @@ def keep(name: str, folders: Sequence[Path], commit: str | None = None, pages: P
         commit: of the tree that made them; None: the one here.
         pages: where docs/results is.
     """
-    runs = [_kept(folder, commit or _commit())._asdict() for folder in folders]
-    write_json(pages / "data" / f"{name}.json", {"runs": runs})
+    runs = [_kept(folder, commit or _commit()) for folder in folders]
+    if (columns := COLUMNS.get(name)) is not None:
+        tables = [{name: [{c: row[c] for c in columns} for row in run.tables[name]]} for run in runs]
+        runs = [run._replace(result={}, tables=kept) for run, kept in zip(runs, tables, strict=True)]
+    write_json(pages / "data" / f"{name}.json", {"runs": [run._asdict() for run in runs]})
 
 
 def load(name: str, pages: Path = PAGES) -> list[Run]:
@@ -179,10 +189,11 @@ def search(runs: Sequence[Run]) -> str:
         geometric = given.get("fidelity") == "geometric"
         matcher = "geometric" if geometric else {"sgbm": "SGBM"}.get(given.get("matcher", "sgbm"), "sweep")
         layout = given.get("sensor", "log_polar").replace("_", "-")
+        policy = f", {given['acquisition']}" if "acquisition" in given else ""
         errors = [float(row["target_error_m"]) for row in episodes if row["target_error_m"]]
         rows.append(
             [
-                f"{float(given.get('sensor.fov_deg', 135)):.0f}°, {layout}, {matcher}",
+                f"{float(given.get('sensor.fov_deg', 135)):.0f}°, {layout}, {matcher}{policy}",
                 f"{found} of {len(episodes)}",
                 mean_with_interval([float(row["saccades_to_target"]) for row in episodes]),
                 percent(run.result["phantom_share"]),
@@ -207,6 +218,22 @@ def rows_of(stem: str, names: Mapping[str, str], form: Callable[[str, str], str]
         return markdown(list(names.values()), rows)
 
     return table
+
+
+def honesty(runs: Sequence[Run]) -> str:
+    """How far a memory's uncertainty can be believed, look after look; intervals over scenes."""
+    rows = []
+    # by sensor as they were looked through, then by size; looks stay in order
+    given = sorted((row for run in runs for row in run.tables["honesty"]), key=lambda row: int(row["cells"]))
+    sensors = list(dict.fromkeys(row["sensor"] for row in given))
+    for row in sorted(given, key=lambda row: sensors.index(row["sensor"])):
+        number = {name: float(cell) for name, cell in row.items() if name != "sensor" and cell}
+        inside = "{coverage_95:.3f} ({coverage_95_low:.3f}–{coverage_95_high:.3f})".format(**number)
+        shares = [percent(number[name]) for name in ("outlier_share", "median_error", "mean_error")]
+        nees, half = (f"{number[name]:.2f}" for name in ("nees_mean", "coverage_50"))
+        rows.append([row["sensor"], f"{number['cells']:,.0f}", row["looks"], nees, half, inside, *shares])
+    columns = ("sensor", "cells", "looks", "NEES", "in 50%", "in 95%", "beyond 5σ", "median error", "mean error")
+    return markdown(columns, rows)
 
 
 def claims(runs: Sequence[Run]) -> str:
@@ -237,6 +264,8 @@ FUSION = {
 TABLES: dict[str, Callable[[Sequence[Run]], str]] = {
     "pair": pair,
     "search": search,
+    "widest": search,
+    "honesty": honesty,
     "fusion": rows_of("fusion", FUSION, short),
     "claims": claims,
 }

@@ -26,6 +26,10 @@ FUSION = """sensor,fusion,saccades,range_ratio_median,nees_mean,z2_median,outlie
 log_polar,"inverse_range, a cell a point",5,1.0001,1.2638,0.5728,0.0276
 uniform,printed,20,0.935,11.6,18.94,0.38
 """
+HONESTY = """sensor,cells,looks,nees_mean,coverage_50,coverage_95,coverage_95_low,coverage_95_high,\
+outlier_share,median_error,mean_error
+sgbm,20000,5,0.8512,0.711,0.9284,0.9221,0.9333,0.0222,0.0101,0.0502
+"""
 CLAIM = {
     "section": "7.2", "text": "A fovea helps", "verdict": "holds", "estimate": 8.4, "ci_low": 6.2, "ci_high": 10.1,
     "n": 20,
@@ -64,6 +68,16 @@ def run_of(folder, command, words, result, **tables):
                 "| log-polar | 5 | inverse range, a cell a point | 1.00 | 1.26 | 0.573 | 2.8% |",
                 "| uniform | 20 | printed | 0.935 | 11.6 | 18.9 | 38.0% |",
             ],
+        ),
+        (
+            "widest",
+            ("search", ["fidelity=geometric", "acquisition=random"], {"phantom_share": 0.0}, {"episodes": EPISODES}),
+            ["| 135°, log-polar, geometric, random | 2 of 3 | 2.00 | 0.0% | 2.0 cm |"],
+        ),
+        (
+            "honesty",
+            ("memory", ["study=honesty"], {}, {"honesty": HONESTY}),
+            ["| sgbm | 20,000 | 5 | 0.85 | 0.71 | 0.928 (0.922–0.933) | 2.2% | 1.0% | 5.0% |"],
         ),
         (
             "claims",
