@@ -31,8 +31,9 @@ from torchfovea.studies.significance import bootstrap_interval
 PAGES = Path(__file__).resolve().parents[1] / "docs" / "results"
 MARKED = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 LARGEST = 20_000  # bytes of a table that is kept
-# what is kept of a table of the same name that has much more, which the run's result repeats
+# what is kept of tables that have much more
 COLUMNS = {
+    "episodes": ("seed", "found", "saccades_to_target", "target_error_m"),
     "honesty": (
         "sensor", "cells", "looks", "nees_mean", "coverage_50", "coverage_95", "coverage_95_low", "coverage_95_high",
         "outlier_share", "median_error", "mean_error",
@@ -48,7 +49,7 @@ class Run(NamedTuple):
         commit: of the tree that ran it; a + behind it: with changes.
         machine: in words.
         result: its result.json, or the list in its claims.json.
-        tables: its small CSV files by their stems, a mapping a row.
+        tables: its small CSV files by their stems, a mapping a row (COLUMNS of it).
     """
 
     command: str
@@ -68,9 +69,8 @@ def keep(name: str, folders: Sequence[Path], commit: str | None = None, pages: P
         pages: where docs/results is.
     """
     runs = [_kept(folder, commit or _commit()) for folder in folders]
-    if (columns := COLUMNS.get(name)) is not None:
-        tables = [{name: [{c: row[c] for c in columns} for row in run.tables[name]]} for run in runs]
-        runs = [run._replace(result={}, tables=kept) for run, kept in zip(runs, tables, strict=True)]
+    # a study's result repeats its table
+    runs = [run._replace(result={}) if name in run.tables else run for run in runs]
     write_json(pages / "data" / f"{name}.json", {"runs": [run._asdict() for run in runs]})
 
 
@@ -100,7 +100,9 @@ def _kept(folder: Path, commit: str) -> Run:
     for path in sorted(folder.glob("*.csv")):
         if path.stat().st_size <= LARGEST:
             with path.open(newline="", encoding="utf-8") as file:
-                tables[path.stem] = list(csv.DictReader(file))
+                rows = list(csv.DictReader(file))
+            names = COLUMNS.get(path.stem)
+            tables[path.stem] = [{name: row[name] for name in names or row if name in row} for row in rows]
     said = " ".join(["torchfovea", command, *(word for word in words if not word.startswith(("picture=", "workers=")))])
     return Run(said, commit, _machine(), result, tables)
 
@@ -264,6 +266,7 @@ FUSION = {
 TABLES: dict[str, Callable[[Sequence[Run]], str]] = {
     "pair": pair,
     "search": search,
+    "others": search,
     "widest": search,
     "honesty": honesty,
     "fusion": rows_of("fusion", FUSION, short),

@@ -111,11 +111,11 @@ def test_a_mean_has_an_interval_where_runs_differ():
     assert mean == "2.67" and 2 <= low < 2.67 < high <= 4
 
 
-def test_large_tables_stay_where_they_are(tmp_path):
-    folder = run_of(tmp_path / "run", "search", [], {"a": 1}, episodes="a\n1\n", saccades="a\n" + "1\n" * 20_000)
+def test_large_tables_and_columns_that_no_table_shows_stay_where_they_are(tmp_path):
+    folder = run_of(tmp_path / "run", "search", [], {"a": 1}, episodes="seed,b\n1,2\n", saccades="a\n" + "1\n" * 20_000)
     results.keep("search", [folder], "abc1234", tmp_path)
     (kept,) = results.load("search", tmp_path)
-    assert kept.tables == {"episodes": [{"a": "1"}]} and kept.result == {"a": 1}
+    assert kept.tables == {"episodes": [{"seed": "1"}]} and kept.result == {"a": 1}
 
 
 def test_the_pages_say_what_their_data_say():
