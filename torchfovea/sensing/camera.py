@@ -121,7 +121,8 @@ class Pinhole:
 
     def in_view(self, direction: Tensor) -> Tensor:
         """Whether directions (..., 3) lie in front of the camera, so that they have a pixel; bool (...)."""
-        return direction[..., 2] > 1e-6 * direction.abs().sum(-1)
+        x, y, z = direction.unbind(-1)  # a sum over strided axes takes several times as long
+        return z > 1e-6 * (x.abs() + y.abs() + z.abs())
 
     def scaled(self, scale: float, shift_px: tuple[float, float]) -> Pinhole:
         """The same camera in other pixels: place p becomes scale · p + shift."""
