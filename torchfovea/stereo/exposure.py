@@ -36,6 +36,7 @@ def alike(pair: Tensor) -> Tensor:
     curve = torch.lerp(left[k - 1], left[k], part.clamp(0, 1))
     # read from a table of even steps, which is faster than a search for every pixel
     at = pair[1].clamp(0, 1) * STEPS
-    step = at.long().clamp(max=STEPS - 1)
-    mapped = torch.lerp(curve[step], curve[step + 1], at - step)
+    step = at.int().clamp(max=STEPS - 1)
+    low, high = (curve.index_select(0, (step + k).flatten()).view_as(at) for k in (0, 1))
+    mapped = torch.lerp(low, high, at - step)
     return torch.stack([pair[0], mapped])

@@ -59,11 +59,10 @@ def refine_reading(
         edge_px: neighbouring disparities further apart than this are different surfaces.
         move: whether to take the refined disparities, or only what the images say of those that were read.
     """
-    shift, noise = shift_px.clone(), torch.zeros_like(shift_px)
-    mismatch, remains = torch.zeros_like(shift_px), torch.zeros_like(shift_px)
     parts = sheets(eye.retina, 1 / eye.scale, shift_px.device, shift_px.dtype)
     cells = [sheet.px.flatten(0, 1) for sheet in parts]
     values = (told.split([len(own) for own in cells]) for told in read(torch.cat(cells)))
+    rows = []
     for sheet, there, trusted in zip(parts, *values, strict=True):
         ray = sheet_rays(eye, sheet.px)
         depth = sheet_depth(eye, sheet.px)[0]
@@ -83,16 +82,16 @@ def refine_reading(
             1 - offset.correlation,
             wide[:, 0] / wide[:, 1].clamp(min=1e-3),
         ]
-        (by, sigma, differs, rest), told = (
-            x[0] for x in read_sheet(sheet, torch.stack(refined, 1), there[None], trusted, edge)
-        )
-        told = told & found[sheet.rf]
-        if move:
-            shift[sheet.rf] += torch.where(told, by, torch.zeros_like(by))
-        noise[sheet.rf] = torch.where(told, sigma, edge_px)
-        mismatch[sheet.rf] = torch.where(told, differs, torch.ones_like(differs))
-        remains[sheet.rf] = torch.where(told, rest, torch.zeros_like(rest))
-    return Reading(shift, noise * found, mismatch * found, remains)
+        own, told = read_sheet(sheet, torch.stack(refined, 1), there[None], trusted, edge)
+        rows.append(torch.cat([own[0], told.to(own)]))
+    # every RF is of one sheet
+    every, rf = torch.cat(rows, 1), torch.cat([sheet.rf for sheet in parts])
+    by, sigma, differs, rest, told = torch.empty_like(every).scatter_(1, rf.expand(5, -1), every)
+    told = (told > 0) & found
+    nothing = torch.zeros_like(by)
+    shift = shift_px + torch.where(told, by, nothing) if move else shift_px.clone()
+    noise = torch.where(told, sigma, edge_px) * found
+    return Reading(shift, noise, torch.where(told, differs, 1) * found, torch.where(told, rest, nothing))
 
 
 @torch.no_grad()
@@ -112,10 +111,14 @@ def standing_out(rest: Tensor, width_px: Tensor, found: Tensor) -> Tensor:
         (N,), standard deviations above the median; 0 below it, and where nothing is read.
     """
     told = found & (rest > 0)
-    level = rest.clamp(min=1e-12).log()
-    step = (3 * width_px.clamp(min=1).log2()).round().long()
-    for k in step[told].unique().tolist():
-        alike = step == k
-        level = torch.where(alike, level - level[alike & told].median(), level)
-    spread = 1.4826 * level[told].abs().median() if bool(told.any()) else level.new_ones(())
-    return torch.where(told, level.clamp(min=0) / spread.clamp(min=1e-3), torch.zeros_like(level))
+    index = told.nonzero()[:, 0]
+    if len(index) == 0:
+        return torch.zeros_like(rest)
+    level = rest.index_select(0, index).clamp(min=1e-12).log()
+    step = (3 * width_px.index_select(0, index).clamp(min=1).log2()).round().long()
+    for k in step.bincount().nonzero()[:, 0].tolist():
+        alike = (step == k).nonzero()[:, 0]
+        own = level.index_select(0, alike)
+        level.index_copy_(0, alike, own - own.median())
+    spread = 1.4826 * level.abs().median()
+    return torch.zeros_like(rest).index_copy_(0, index, level.clamp_(min=0) / spread.clamp(min=1e-3))

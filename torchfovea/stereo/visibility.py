@@ -100,21 +100,22 @@ def undisputed(left: Tensor, right: Tensor, disparity: Tensor, valid: Tensor, st
         step: see `outdone`.
     """
     height, width = left.shape
-    x = torch.arange(width, device=left.device, dtype=left.dtype)
-    there = (x - disparity).clamp(0, width - 1)
-    first = there.floor().clamp(max=width - 2)
-    row = torch.arange(height, device=left.device)[:, None]
-    index, flat = (first.long() + width * row).flatten(), right.flatten()
-    one, other = (flat.index_select(0, index + k).view_as(left) for k in (0, 1))
-    like = torch.lerp(one, other, there - first)
-    weight = valid.to(left)
     if valid.count_nonzero() < 2:
         return valid, torch.zeros_like(disparity)
+    x = torch.arange(width, device=left.device, dtype=left.dtype)
+    there = (x - disparity).clamp_(0, width - 1)
+    first = there.int().clamp_(max=width - 2)
+    row = torch.arange(height, device=left.device)[:, None]
+    index, flat = (first + width * row.int()).flatten(), right.flatten()
+    one, other = (flat.index_select(0, index + k).view_as(left) for k in (0, 1))
+    like = torch.lerp(one, other, there.sub_(first))
+    weight = valid.to(left)
     # exposures differ: one gain and offset
-    mine, theirs = ((image - (image * weight).sum() / weight.sum()) for image in (left, like))
-    gain = (mine.square() * weight).sum().sqrt() / (theirs.square() * weight).sum().sqrt().clamp(min=1e-6)
-    square = (mine - gain * theirs).square()
-    misfit = average(torch.stack([square * weight, weight]), 1, False)
+    count = weight.sum()
+    mine, theirs = ((image - (image * weight).sum() / count) for image in (left, like))
+    gain = (mine.square().mul_(weight).sum() / theirs.square().mul_(weight).sum().clamp(min=1e-12)).sqrt()
+    square = (mine - gain * theirs).square_()
+    misfit = average(torch.stack([square.mul_(weight), weight]), 1, False)
     misfit = misfit[0] / misfit[1].clamp(min=1e-6)
     cell = columns((x - disparity).round().long().view(1, -1), row.expand(-1, width).reshape(1, -1))
     shift, share, claim = (part.view(1, -1) for part in (disparity, misfit, valid))
