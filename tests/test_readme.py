@@ -1,5 +1,6 @@
 """What README.md and the pages of docs/ print is true: code runs, commands compose, links lead somewhere."""
 
+import pydoc
 import re
 import shlex
 from pathlib import Path
@@ -119,6 +120,13 @@ def test_the_readme_finds_the_nearest_object(tmp_path, monkeypatch, capsys):
 
 def test_the_readme_is_read_in_three_minutes():
     assert len(PAGES["README.md"].splitlines()) <= 150
+
+
+def test_every_equation_of_the_paper_has_its_code():
+    table = PAGES["docs/paper.md"].split("## Each equation\n")[1].split("\n## ")[0]
+    assert [int(number) for number in re.findall(r"Eq\. (\d+)", table)] == list(range(1, 56))
+    for name in re.findall(r"`(\w+\.[\w.]+)`", table):
+        assert pydoc.locate(f"torchfovea.{name}"), name
 
 
 def test_every_command_is_named():
