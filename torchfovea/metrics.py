@@ -35,6 +35,8 @@ __all__ = [
     "regret",
     "regret_per_saccade",
     "saccades_to_target",
+    "weighted_mean",
+    "weighted_median",
 ]
 
 
@@ -265,6 +267,20 @@ def ause(error: Tensor, uncertainty: Tensor, valid: Tensor | None = None) -> Ten
     mean = size.mean()
     curve = (ranked.cumsum(0) - size.sort().values.cumsum(0)) / left
     return torch.where(mean > 0, curve.mean() / torch.where(mean > 0, mean, 1.0), 0.0)
+
+
+def weighted_mean(values: Tensor, weight: Tensor) -> float:
+    """Of values (N,) of any type, by weights (N,); those without weight may be NaN. NaN for no weight at all."""
+    there = weight > 0
+    return float((values[there].double() * weight[there]).sum() / weight.sum())
+
+
+def weighted_median(values: Tensor, weight: Tensor) -> float:
+    """The lower of two, of values (N,) by weights (N,), some of which are positive; the others' may be NaN."""
+    values, weight = values[weight > 0], weight[weight > 0]
+    order = values.argsort()
+    total = weight[order].cumsum(0)
+    return float(values[order][int((total < total[-1] / 2).sum())])
 
 
 def _flat(x: Tensor, valid: Tensor | None) -> Tensor:

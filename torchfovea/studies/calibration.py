@@ -21,7 +21,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchfovea.metrics import ause, gaussian_nll
+from torchfovea.metrics import ause, gaussian_nll, weighted_mean, weighted_median
 from torchfovea.sensing.camera import Camera
 from torchfovea.sensing.correspondence import Budget, Clues, Correspondences, doubt, eye_sigma_px, inlier_share
 from torchfovea.sensing.head import Eyes
@@ -240,19 +240,19 @@ def judge(data: Judged, sigma: Tensor, inlier: Tensor | None = None, weight: Ten
     estimate = torch.where(near, estimate, torch.ones_like(estimate))
     miss, width = (error / (estimate * true)).abs()[near], (1.96 * sigma / estimate.square())[near]
     core, likely = w * (z <= OUTLIER), w * (p > 0.5)
-    ratio = _median(width, w[near]) / _median(miss, w[near]) if bool(near.any()) else math.nan
+    ratio = weighted_median(width, w[near]) / weighted_median(miss, w[near]) if bool(near.any()) else math.nan
     return {
-        "nees_mean": _mean(z.square(), core),
-        **{f"coverage_{round(100 * level)}": _mean(hit.double(), w) for level, hit in inside.items()},
-        "nll": _mean(gaussian_nll(error, sigma.square()), w),
-        "outlier_share": _mean((z > OUTLIER).double(), w),
+        "nees_mean": weighted_mean(z.square(), core),
+        **{f"coverage_{round(100 * level)}": weighted_mean(hit, w) for level, hit in inside.items()},
+        "nll": weighted_mean(gaussian_nll(error, sigma.square()), w),
+        "outlier_share": weighted_mean(z > OUTLIER, w),
         "ause": float(ause(error, sigma)),
         "interval_over_error": ratio,
-        "inlier_share": _mean((p > 0.5).double(), w),
-        "inlier_coverage_50": _mean(inside[0.5].double(), likely),
-        "inlier_coverage_95": _mean(inside[0.95].double(), likely),
-        "inlier_mean": _mean(p, w),
-        "mixture_nll": _mean(mixture_nll(error, sigma.square(), p, data.line.double()), w),
+        "inlier_share": weighted_mean(p > 0.5, w),
+        "inlier_coverage_50": weighted_mean(inside[0.5], likely),
+        "inlier_coverage_95": weighted_mean(inside[0.95], likely),
+        "inlier_mean": weighted_mean(p, w),
+        "mixture_nll": weighted_mean(mixture_nll(error, sigma.square(), p, data.line.double()), w),
     }
 
 
@@ -280,20 +280,8 @@ def reliability(
         row = (inlier > low) & (inlier <= high)
         if bool(row.any()):
             some = w * row
-            rows.append((low, high, int(row.sum()), _mean(inlier, some), _mean(near.double(), some)))
+            rows.append((low, high, int(row.sum()), weighted_mean(inlier, some), weighted_mean(near, some)))
     return rows
-
-
-def _mean(values: Tensor, weight: Tensor) -> float:
-    """Weighted; NaN for no weight at all."""
-    return float((values.double() * weight).sum() / weight.sum())
-
-
-def _median(values: Tensor, weight: Tensor) -> float:
-    """Weighted; the lower of two."""
-    order = values.argsort()
-    total = weight[order].cumsum(0)
-    return float(values[order][int((total < total[-1] / 2).sum())])
 
 
 def mixture_std(sigma: Tensor, inlier: Tensor, spread: Tensor) -> Tensor:

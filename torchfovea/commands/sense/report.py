@@ -10,6 +10,7 @@ from torch import Tensor
 from torchfovea.commands.shared.pairs import Pair
 from torchfovea.commands.shared.regions import at_places, hidden_places
 from torchfovea.gaussian import Gaussian, columns
+from torchfovea.metrics import gaussian_nll, weighted_mean, weighted_median
 from torchfovea.sensing.layout import Retina
 from torchfovea.sensing.triangulation import Observations
 from torchfovea.stereo.maps import match_disparity
@@ -45,8 +46,8 @@ def match_figures(
     kinds = {"": on, "_by_area": area * on}
     inlier = valid.to(area) if observed.inlier is None else observed.inlier
     figures: dict[str, float] = {"points": int(chosen.sum())}
-    figures |= {f"valid_fraction{k}": _mean(valid, w) for k, w in kinds.items()}
-    figures |= {f"inlier_mean{k}": _mean(inlier, w * valid) for k, w in kinds.items() if bool(valid.any())}
+    figures |= {f"valid_fraction{k}": weighted_mean(valid, w) for k, w in kinds.items()}
+    figures |= {f"inlier_mean{k}": weighted_mean(inlier, w * valid) for k, w in kinds.items() if bool(valid.any())}
     if pair.disparity is None:
         return figures
     depth = pair.depth_m(read_at_fields(pair.disparity, views, retina))
@@ -58,20 +59,20 @@ def match_figures(
     z = (error / observed.cov[:, 5].sqrt()).abs()
     miss = (points.mean[:, 2] - depth).abs()
     for suffix, weight in kinds.items():
-        figures[f"hidden_valid{suffix}"] = _mean(valid, weight * (hidden & known))
+        figures[f"hidden_valid{suffix}"] = weighted_mean(valid, weight * (hidden & known))
         here = weight * (valid & known & ~hidden) if pair.seen is not None else weight * (valid & known)
         if not bool(here.any()):
             continue
-        figures[f"median_error_m{suffix}"] = _median(miss, here)
-        figures[f"nees_mean{suffix}"] = _mean(z.square(), here * (z <= OUTLIER))
+        figures[f"median_error_m{suffix}"] = weighted_median(miss, here)
+        figures[f"nees_mean{suffix}"] = weighted_mean(z.square(), here * (z <= OUTLIER))
         for level in LEVELS:
             inside = z <= math.sqrt(2) * float(torch.erfinv(torch.tensor(level, dtype=torch.float64)))
-            figures[f"coverage_{round(100 * level)}{suffix}"] = _mean(inside, here)
+            figures[f"coverage_{round(100 * level)}{suffix}"] = weighted_mean(inside, here)
             if level in (0.5, 0.95):
-                figures[f"inlier_coverage_{round(100 * level)}{suffix}"] = _mean(inside, here * (inlier > 0.5))
-        figures[f"outlier_share{suffix}"] = _mean(z > OUTLIER, here)
-        figures[f"inlier_share{suffix}"] = _mean(inlier > 0.5, here)
-        figures[f"nll{suffix}"] = _mean(z.square() / 2 + (2 * math.pi * observed.cov[:, 5]).log() / 2, here)
+                figures[f"inlier_coverage_{round(100 * level)}{suffix}"] = weighted_mean(inside, here * (inlier > 0.5))
+        figures[f"outlier_share{suffix}"] = weighted_mean(z > OUTLIER, here)
+        figures[f"inlier_share{suffix}"] = weighted_mean(inlier > 0.5, here)
+        figures[f"nll{suffix}"] = weighted_mean(gaussian_nll(error, observed.cov[:, 5]), here)
     return figures
 
 
@@ -105,17 +106,3 @@ def image_seen(views: Views, retina: Retina | None) -> float:
     place = columns(*torch.broadcast_tensors(column, row[:, None]))
     there = (place - place.new_tensor(views.origin_px(retina))) / views.scale(retina)
     return float(retina.inside(there).double().mean())
-
-
-def _mean(values: Tensor, weight: Tensor) -> float:
-    """Weighted; NaN for no weight at all."""
-    there = weight > 0
-    return float((values[there].double() * weight[there]).sum() / weight.sum())
-
-
-def _median(values: Tensor, weight: Tensor) -> float:
-    """Weighted; the lower of two."""
-    values, weight = values[weight > 0], weight[weight > 0]
-    order = values.argsort()
-    total = weight[order].cumsum(0)
-    return float(values[order][int((total < total[-1] / 2).sum())])
