@@ -440,8 +440,8 @@ def test_a_mistake_is_one_line_and_leaves_nothing(folder, capsys, overrides, lin
 def test_the_budgets_that_come_along(name):
     from hydra import compose, initialize_config_dir
 
-    from torchfovea.commands.shared.build import construct
     from torchfovea.commands.shared.config import conf_dir
+    from torchfovea.commands.shared.settings import construct
 
     with initialize_config_dir(conf_dir(), version_base="1.3"):
         cfg = compose("sense", [f"budget={name}"])

@@ -16,9 +16,9 @@ from torchfovea.commands.bench.paths import paths_of_look
 from torchfovea.commands.bench.retina_paths import path_of_retina
 from torchfovea.commands.bench.steps import batched_steps, paths_of_steps
 from torchfovea.commands.bench.timing import Path
-from torchfovea.commands.shared.build import build_cells, build_observer, choice, whole
+from torchfovea.commands.shared.build import build_cells, build_observer
 from torchfovea.commands.shared.rehearsal import rehearse
-from torchfovea.commands.shared.settings import changed, construct
+from torchfovea.commands.shared.settings import changed, choice, construct, whole
 from torchfovea.perception import Observer
 from torchfovea.sensing.layout import LogPolar
 from torchfovea.setting import require

@@ -13,9 +13,9 @@ import torch
 from omegaconf import DictConfig
 
 from torchfovea.commands.bench.timing import Path, Peer, compiled_peer, same
-from torchfovea.commands.shared.build import build_arena, build_cells, build_scene_of, number, whole
+from torchfovea.commands.shared.build import build_arena, build_cells, build_scene_of
 from torchfovea.commands.shared.rollout import roll_out
-from torchfovea.commands.shared.settings import changed
+from torchfovea.commands.shared.settings import changed, number, whole
 from torchfovea.compiling import compiling
 from torchfovea.deciding.weighted import Weighting
 from torchfovea.perception import Observer, Step, compiled, decide, new_memory, perceive

@@ -15,12 +15,13 @@ from torchfovea.commands.calibrate.report import bins, print_judgements, regions
 from torchfovea.commands.calibrate.simulated import SceneTask, looks_at_scenes, viewed
 from torchfovea.commands.calibrate.truths import Truths, look_at_pair
 from torchfovea.commands.shared.budgets import build_budget, made_for, write_budget
-from torchfovea.commands.shared.build import build_head, build_matcher, build_sensor, construct, whole
+from torchfovea.commands.shared.build import build_head, build_matcher, build_sensor
 from torchfovea.commands.shared.config import run_folder, sized
 from torchfovea.commands.shared.pairs import OWN, Pair, check_named, gaze_of, load_pair, named_pair
 from torchfovea.commands.shared.parallel import workers_of
 from torchfovea.commands.shared.rehearsal import rehearse
 from torchfovea.commands.shared.screen import say
+from torchfovea.commands.shared.settings import construct, whole
 from torchfovea.commands.shared.unread import refuse_unread
 from torchfovea.files import write_csv, write_result
 from torchfovea.sensing.correspondence import Budget

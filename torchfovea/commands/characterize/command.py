@@ -12,11 +12,11 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from torchfovea.commands.characterize.honesty import CHUNK, plan_cases, plan_planes, propagate, realise
-from torchfovea.commands.shared.build import build_camera, build_matcher, construct, number, whole
+from torchfovea.commands.shared.build import build_camera, build_matcher
 from torchfovea.commands.shared.config import run_folder, sized
 from torchfovea.commands.shared.manifest import complete, finished
 from torchfovea.commands.shared.screen import print_figures, progress_bar
-from torchfovea.commands.shared.settings import wholes
+from torchfovea.commands.shared.settings import construct, number, whole, wholes
 from torchfovea.commands.shared.unread import refuse_unread
 from torchfovea.files import write_csv
 from torchfovea.sensing.correspondence import Budget

@@ -12,8 +12,8 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
-from torchfovea.commands.shared.build import build_matcher, whole
-from torchfovea.commands.shared.settings import numbers, wholes
+from torchfovea.commands.shared.build import build_matcher
+from torchfovea.commands.shared.settings import numbers, whole, wholes
 from torchfovea.files import write_csv
 from torchfovea.sensing.unscented import SigmaPoints
 from torchfovea.setting import require

@@ -9,11 +9,12 @@ from rich.table import Table
 from torchfovea.commands.memory.honesty import plan_honesty, study_honesty
 from torchfovea.commands.memory.moving import study_moving, study_resampling
 from torchfovea.commands.memory.study import Rows, study_encoders, study_fusion
-from torchfovea.commands.shared.build import build_arena, build_cells, build_observer, choice, number, whole
+from torchfovea.commands.shared.build import build_arena, build_cells, build_observer
 from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.memories import aimed, loaded_memory, memory_path
 from torchfovea.commands.shared.rehearsal import rehearse
 from torchfovea.commands.shared.screen import print_figures, wide_screen
+from torchfovea.commands.shared.settings import choice, number, whole
 from torchfovea.files import write_csv, write_result
 from torchfovea.memory.nearest import neighbour_spacing_rad
 from torchfovea.memory.store import save_memory

@@ -11,11 +11,11 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from torchfovea.commands.memory.study import Rows
-from torchfovea.commands.shared.build import build_arena, build_cells, build_observer, whole
+from torchfovea.commands.shared.build import build_arena, build_cells, build_observer
 from torchfovea.commands.shared.config import conf_dir
 from torchfovea.commands.shared.judge import Judge, fixation_course, judge_cells
 from torchfovea.commands.shared.screen import progress_bar
-from torchfovea.commands.shared.settings import changed, wholes, words
+from torchfovea.commands.shared.settings import changed, whole, wholes, words
 from torchfovea.memory.egosphere import Memory, belief, trust
 from torchfovea.metrics import coverage, nees_mean, outlier_share
 from torchfovea.perception import Observer, new_memory, perceive

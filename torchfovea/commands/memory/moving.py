@@ -10,8 +10,9 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from torchfovea.commands.memory.study import COLUMNS, Rows, figures_of
-from torchfovea.commands.shared.build import build_arena, build_cells, build_observer, number, whole
+from torchfovea.commands.shared.build import build_arena, build_cells, build_observer
 from torchfovea.commands.shared.judge import estimate, fixation_course, judge_cells
+from torchfovea.commands.shared.settings import number, whole
 from torchfovea.memory.egosphere import Memory
 from torchfovea.memory.moving import move, resample
 from torchfovea.metrics import gap

@@ -11,8 +11,9 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from torchfovea.commands.shared.build import build_arena, build_cells, build_observer, whole
+from torchfovea.commands.shared.build import build_arena, build_cells, build_observer
 from torchfovea.commands.shared.judge import Judge, estimate, fixation_course, judge_cells
+from torchfovea.commands.shared.settings import whole
 from torchfovea.memory.egosphere import Fusion, Prior
 from torchfovea.perception import Observer, new_memory, perceive
 from torchfovea.sensing.head import Gaze, eyes

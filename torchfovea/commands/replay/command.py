@@ -12,10 +12,11 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from torchfovea.cloud import carried_colours, cloud_of, painted, unpainted, write_cloud
-from torchfovea.commands.shared.build import build_cells, build_match, build_observer, name_of
+from torchfovea.commands.shared.build import build_cells, build_match, build_observer
 from torchfovea.commands.shared.cameras import OF_FILES, cameras_of_files
 from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.memories import loaded_memory, memory_path
+from torchfovea.commands.shared.named import name_of
 from torchfovea.commands.shared.rehearsal import rehearse
 from torchfovea.commands.shared.rollout import sample_of
 from torchfovea.commands.shared.screen import print_figures, progress_bar, say

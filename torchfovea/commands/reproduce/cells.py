@@ -12,10 +12,11 @@ from typing import Any, NamedTuple
 import torch
 from hydra.core.global_hydra import GlobalHydra
 
-from torchfovea.commands.shared.build import build_observer, whole
+from torchfovea.commands.shared.build import build_observer
 from torchfovea.commands.shared.composed import compose_search
 from torchfovea.commands.shared.figures import EPISODE_COLUMNS, episode_row
 from torchfovea.commands.shared.rollout import batched, one_episode, roll_out
+from torchfovea.commands.shared.settings import whole
 from torchfovea.deciding.strategies import upper_confidence_bound
 from torchfovea.episode import Episode
 from torchfovea.setting import require

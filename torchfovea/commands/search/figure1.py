@@ -7,7 +7,8 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig
 
-from torchfovea.commands.shared.build import build_arena, build_observer, name_of
+from torchfovea.commands.shared.build import build_arena, build_observer
+from torchfovea.commands.shared.named import name_of
 from torchfovea.commands.shared.precision import EGO, Dots, bearings_deg, both_sensors, headline, measured
 from torchfovea.gaussian import Gaussian, columns
 from torchfovea.perception import Observer, observed

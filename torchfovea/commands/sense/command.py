@@ -16,10 +16,12 @@ from torchfovea.commands.sense.figure1 import draw_pair, retinas_of
 from torchfovea.commands.sense.points import Sensed, match_and_sense
 from torchfovea.commands.sense.report import beside, image_seen, match_figures, read_at_fields
 from torchfovea.commands.shared.budgets import build_budget
-from torchfovea.commands.shared.build import build_match, build_sensor, choice, name_of
+from torchfovea.commands.shared.build import build_match, build_sensor
 from torchfovea.commands.shared.config import run_folder
+from torchfovea.commands.shared.named import name_of
 from torchfovea.commands.shared.pairs import Pair, gaze_of, load_pair
 from torchfovea.commands.shared.screen import print_figures, say
+from torchfovea.commands.shared.settings import choice
 from torchfovea.commands.shared.unread import refuse_unread
 from torchfovea.files import replacing, write_result
 from torchfovea.sensing.correspondence import Budget, Disparity

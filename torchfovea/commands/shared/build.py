@@ -51,11 +51,6 @@ __all__ = [
     "build_scene_of",
     "build_sensor",
     "check_readable",
-    "choice",
-    "construct",
-    "name_of",
-    "number",
-    "whole",
 ]
 
 # settings of the group sensor that are not the layout's own

@@ -16,7 +16,7 @@ from joblib.externals.loky.process_executor import TerminatedWorkerError
 from omegaconf import DictConfig, OmegaConf
 
 from torchfovea.allocation import keep_memory
-from torchfovea.commands.shared.build import whole
+from torchfovea.commands.shared.settings import whole
 from torchfovea.setting import SettingError, require
 
 __all__ = ["spread", "workers_of"]

@@ -13,9 +13,9 @@ from torchfovea.commands.shared.build import (
     build_renderer,
     build_route,
     build_scene_of,
-    name_of,
 )
 from torchfovea.commands.shared.memories import aimed, loaded_memory, memory_path
+from torchfovea.commands.shared.named import name_of
 from torchfovea.commands.shared.settings import changed, number, whole
 from torchfovea.commands.shared.strategy import build_stop, build_strategy
 from torchfovea.perception import Observer

@@ -11,8 +11,9 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from torchfovea.arena import Truth
-from torchfovea.commands.shared.build import build_arena, build_cells, build_motor, build_scene_of, name_of
+from torchfovea.commands.shared.build import build_arena, build_cells, build_motor, build_scene_of
 from torchfovea.commands.shared.memories import aimed, loaded_memory
+from torchfovea.commands.shared.named import name_of
 from torchfovea.commands.shared.settings import device_of, number, whole
 from torchfovea.commands.shared.strategy import build_stop, build_strategy
 from torchfovea.deciding.strategies import Strategy

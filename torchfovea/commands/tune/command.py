@@ -13,11 +13,12 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from rich.console import Console
 
-from torchfovea.commands.shared.build import build_observer, construct, name_of, number, whole
+from torchfovea.commands.shared.build import build_observer
 from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.manifest import complete, finished
+from torchfovea.commands.shared.named import name_of
 from torchfovea.commands.shared.screen import progress_bar
-from torchfovea.commands.shared.settings import plain, within
+from torchfovea.commands.shared.settings import construct, number, plain, whole, within
 from torchfovea.commands.shared.unread import refuse_unread
 from torchfovea.commands.tune.files import write_memory, write_scenes
 from torchfovea.commands.tune.judge import build_start, judge_policies, move_start

@@ -15,8 +15,8 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from torchfovea.commands.shared.build import whole
 from torchfovea.commands.shared.screen import progress_bar
+from torchfovea.commands.shared.settings import whole
 from torchfovea.files import write_csv, write_tensors
 from torchfovea.setting import SettingError, require
 from torchfovea.tuning.baselines import TABLE_1, table_1
