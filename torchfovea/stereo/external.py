@@ -111,13 +111,13 @@ class External:
         return self.sure_px + (self.unsure_px - self.sure_px) * doubt**self.power
 
 
-def load_matcher(source: str, setting: str = "matcher.source") -> DisparityFunction:
+def load_matcher(source: str) -> DisparityFunction:
     """A function by its name, ``package.module:function``.
 
     Raises:
         SettingError: for another form, a module that does not import, or a name that is no function.
     """
-    found: DisparityFunction = load_function(source, setting, "an existing file or package.module:function")
+    found: DisparityFunction = load_function(source, "matcher.source", "an existing file or package.module:function")
     return found
 
 

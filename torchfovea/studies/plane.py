@@ -17,29 +17,26 @@ from torchfovea.studies.characterization import plane_points
 
 __all__ = ["draw_plane", "octave_noise"]
 
+OCTAVES = 13  # with knots 1 m apart, and half as far in each that follows
 TABLE = 256  # knots of an octave's random surface along a side, after which it repeats
 UNSEEN = 1e-9  # an octave of less contrast is left out
 
 
-def octave_noise(
-    place_m: Tensor, footprint_m: Tensor, generator: torch.Generator, longest_m: float = 1.0, octaves: int = 13
-) -> Tensor:
+def octave_noise(place_m: Tensor, footprint_m: Tensor, generator: torch.Generator) -> Tensor:
     """Noise of equal contrast in every octave.
 
     Args:
         place_m: (..., 2), places on the surface.
         footprint_m: (...), size of what looks at each place; finer octaves fade.
         generator: draws the surface: the same state, the same surface.
-        longest_m: spacing of the coarsest octave's knots.
-        octaves: each has half the spacing of the one before.
 
     Returns:
         (...) in (0, 1). Differentiable in the place.
     """
     total = torch.zeros_like(footprint_m)
     flat = place_m.reshape(1, -1, 1, 2)
-    for k in range(octaves):
-        spacing = longest_m / 2**k
+    for k in range(OCTAVES):
+        spacing = 0.5**k
         table = torch.randn(TABLE, TABLE, generator=generator, dtype=place_m.dtype)
         shift = TABLE * torch.rand(2, generator=generator, dtype=place_m.dtype)
         # two more knots on either side: cubic interpolation goes on across the seam

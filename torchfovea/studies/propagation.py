@@ -36,6 +36,9 @@ __all__ = [
     "unscented",
 ]
 
+# from +x towards +y: up and to the temporal side, so that the right eye sees what a strongly converged left eye sees
+MERIDIAN_RAD = 2.5
+
 
 class StereoCases(NamedTuple):
     """Correspondences of planes, C of them, each with its own pose.
@@ -137,18 +140,14 @@ def noise_ratio(matches: Correspondences, eyes: Eyes, camera: Camera) -> Tensor:
     return sigma / _disparity(px, eyes, camera)
 
 
-def stereo_cases(
-    sensor: PlaneSensor, ratios: Tensor, vergence_rad: Tensor, eccentricity: Tensor, meridian_rad: float = 2.5
-) -> StereoCases:
+def stereo_cases(sensor: PlaneSensor, ratios: Tensor, vergence_rad: Tensor, eccentricity: Tensor) -> StereoCases:
     """Every combination of e, vergence and eccentricity: what one receptive field sees of planes far enough for that e.
 
     Args:
         sensor: the eyes and their error budget.
         ratios: wanted e = σ_D/D, (E,), > 0.
         vergence_rad: (V,).
-        eccentricity: of the left place, as shares of the retina's radius (K,).
-        meridian_rad: of the left place, from +x towards +y; the default lies up and to the temporal side, so that the
-            right eye sees what a strongly converged left eye sees.
+        eccentricity: of the left place on `MERIDIAN_RAD`, as shares of the retina's radius (K,).
 
     Returns:
         At most E·V·K cases in float64, in this order: those whose plane the right eye sees too.
@@ -162,7 +161,7 @@ def stereo_cases(
     grid = torch.cartesian_prod(ratios.double(), vergence_rad.double(), eccentricity.double())
     ratio, vergence, share = grid.reshape(-1, 3).unbind(-1)
     rho = share * sensor.retina.radius_px
-    angle = torch.full_like(rho, -meridian_rad)
+    angle = torch.full_like(rho, -MERIDIAN_RAD)
     left_px = columns(rho * torch.cos(angle), rho * torch.sin(angle)).unsqueeze(-2)
     pose = straight_eyes(sensor.baseline_m, vergence, torch.float64)
     distance = torch.full_like(ratio, 100 * sensor.baseline_m)
@@ -191,13 +190,14 @@ def _mean_px(cases: StereoCases) -> Tensor:
     return torch.cat([cases.matches.left_px, cases.matches.right_px], -1)
 
 
+def _through(cases: StereoCases, chart: str) -> Callable[[Tensor], Tensor]:
+    """From places of cases to coordinates in a chart."""
+    return lambda px: chart_point(px, cases.eyes, cases.camera, chart, cases.direction)[0]
+
+
 def first_order(cases: StereoCases, chart: str) -> Gaussian:
     """The mean's image and J Σ Jᵀ with the Jacobian of automatic differentiation; (C, 3) and packed (C, 6)."""
-    px = _mean_px(cases)
-
-    def through(place: Tensor) -> Tensor:
-        return chart_point(place, cases.eyes, cases.camera, chart, cases.direction)[0]
-
+    px, through = _mean_px(cases), _through(cases, chart)
     left, right = cases.matches.left_sigma_px, cases.matches.right_sigma_px
     scaled = elementwise_jacobian(through, px) * torch.stack([left, left, right, right], -1).unsqueeze(-2)
     return Gaussian(through(px).squeeze(-2), pack(scaled @ scaled.mT).squeeze(-2))
@@ -206,11 +206,7 @@ def first_order(cases: StereoCases, chart: str) -> Gaussian:
 def unscented(cases: StereoCases, chart: str, points: SigmaPoints, rotated: bool) -> Gaussian:
     """The unscented transform with some sigma points and root; (C, 3) and packed (C, 6)."""
     root = sigma_root(cases.matches.left_sigma_px, cases.matches.right_sigma_px, rotated)
-
-    def through(place: Tensor) -> Tensor:
-        return chart_point(place, cases.eyes, cases.camera, chart, cases.direction)[0]
-
-    mean, cov, _ = unscented_transform(through, _mean_px(cases), root, points)
+    mean, cov, _ = unscented_transform(_through(cases, chart), _mean_px(cases), root, points)
     return Gaussian(mean.squeeze(-2), cov.squeeze(-2))
 
 
