@@ -71,6 +71,7 @@ FLOORS = (
         "geometric",
         "marks",
         "stripes",
+        "two_rays",
         "pinhole",
         "triangulation",
         "association",

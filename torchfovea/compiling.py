@@ -1,8 +1,8 @@
-"""Hot functions as one kernel each, by `torch.compile`; as they are written they remain the definition.
+"""Whether hot functions run compiled; as they are written they remain the definition.
 
-A kernel is compiled the first time that it runs where compiling is on, for half a minute or so. Its machine code is
-kept on disk, under a key that PyTorch makes of all that it depends on, so that another process starts within seconds.
-On the CPU `torchfovea.machine` has loops in C for most of it, which come first.
+On the CPU `torchfovea.machine` has loops in C for them. On a GPU each is one kernel by `torch.compile`, compiled the
+first time that it runs there, for half a minute or so. Its machine code is kept on disk, under a key that PyTorch makes
+of all that it depends on, so that another process starts within seconds.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ __all__ = [
 MODES = ("off", "auto", "on")
 
 _BACKEND = "inductor"
+_DEVICES = ("cuda",)  # of what a kernel's tensors are on
 _MODE: ContextVar[str] = ContextVar("compile", default="off")
 
 _Given = ParamSpec("_Given")
@@ -75,15 +76,18 @@ def must_compile() -> bool:
 
 
 def kernel(function: Callable[_Given, _Made]) -> Callable[_Given, _Made]:
-    """A pure function of (nested tuples of) tensors and settings that can run compiled, see `compiling`.
+    """A pure function of (nested tuples of) tensors and settings that can run compiled on a GPU, see `compiling`.
 
-    Where a gradient is wanted it runs as written.
+    On the CPU, and where a gradient is wanted, it runs as written.
     """
     compiled: dict[Any, Callable[_Given, _Made] | None] = {}
 
     @wraps(function)
     def run(*args: _Given.args, **kwargs: _Given.kwargs) -> _Made:
-        if _MODE.get() == "off" or (torch.is_grad_enabled() and wants_gradient((args, tuple(kwargs.values())))):
+        given = (args, tuple(kwargs.values()))
+        if _MODE.get() == "off" or not any(tensor.device.type in _DEVICES for tensor in _tensors(given)):
+            return function(*args, **kwargs)
+        if torch.is_grad_enabled() and wants_gradient(given):
             return function(*args, **kwargs)
         first = _BACKEND not in compiled
         if first:
@@ -123,9 +127,16 @@ def _quiet(wanted: bool) -> Iterator[None]:
 
 def wants_gradient(value: Any) -> bool:
     """Whether a gradient is asked of any of the tensors in nested tuples and lists."""
+    return any(tensor.requires_grad for tensor in _tensors(value))
+
+
+def _tensors(value: Any) -> Iterator[torch.Tensor]:
+    """Those in nested tuples and lists."""
     if isinstance(value, tuple | list):
-        return any(map(wants_gradient, value))
-    return isinstance(value, torch.Tensor) and value.requires_grad
+        for part in value:
+            yield from _tensors(part)
+    elif isinstance(value, torch.Tensor):
+        yield value
 
 
 def cache_folder() -> Path:

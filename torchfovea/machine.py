@@ -51,7 +51,7 @@ class Loops:
         Raises:
             MemoryError: where it runs out.
         """
-        function = self._library[name]
+        function = getattr(self._library, name)  # which the library keeps
         function.restype = ctypes.c_int64
         found = int(function(*map(_argument, arguments)))
         if found < 0:

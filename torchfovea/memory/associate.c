@@ -39,7 +39,7 @@ typedef struct {
 
 typedef struct { /* where directions meet the cube, in texels of the table; what is found there */
     REAL x[BLOCK], y[BLOCK], z[BLOCK], u[BLOCK], v[BLOCK], cosine[BLOCK];
-    int32_t row[BLOCK], link[BLOCK], cell[BLOCK], active[BLOCK];
+    int32_t row[BLOCK], link[BLOCK], cell[BLOCK], active[BLOCK], number[BLOCK][SLOTS];
 } Places;
 
 static REAL larger(REAL a, REAL b) { return a > b ? a : b; }
@@ -84,7 +84,8 @@ static void place(const Look *look, const Table *table, int64_t set, int64_t fir
     }
 }
 
-/* Follow texels that are cut into quarters to the row that counts. Level by level, so that memory answers many at once. */
+/* Follow texels that are cut into quarters to the row that counts, and read it. Level by level, so that memory answers
+many at once: the table is larger than a cache. */
 static void follow(const Table *table, int64_t count, Places *at) {
     const int32_t *link = table->link;
     int64_t left = 0;
@@ -104,6 +105,7 @@ static void follow(const Table *table, int64_t count, Places *at) {
         }
         left = more;
     }
+    for (int64_t i = 0; i < count; i++) memcpy(at->number[i], table->cells + (int64_t)at->row[i] * SLOTS, sizeof at->number[i]);
 }
 
 /* The cells nearest to directions, counted through all sets, and the cosines between them. */
@@ -111,7 +113,7 @@ static void find_nearest(const Table *table, int64_t cells, int64_t count, Place
     const double *px = table->vectors, *py = px + cells, *pz = py + cells;
     follow(table, count, at);
     for (int64_t i = 0; i < count; i++) {
-        const int32_t *number = table->cells + (int64_t)at->row[i] * SLOTS;
+        const int32_t *number = at->number[i];
         const REAL x = at->x[i], y = at->y[i], z = at->z[i];
         const double fx = px[number[0]], fy = py[number[0]], fz = pz[number[0]];
         REAL best = 0;

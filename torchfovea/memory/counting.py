@@ -62,8 +62,10 @@ def count_look(
     )
     after = tuple(torch.empty_like(part) for part in before)
     vector, matrix, bearing, looks, lasting, votes = after
-    sums, rest = torch.zeros(9, *shape, dtype=vector.dtype), torch.zeros(6, *shape, dtype=like.dtype)
-    told = (sums[:3], sums[3:], rest[0], rest[1], None if kin is None else rest[2:])
+    told: tuple[Tensor | None, ...] = (vector, matrix, bearing, None, None)
+    sums, rest = (torch.zeros(0 if join else parts, *shape, dtype=t.dtype) for parts, t in ((9, vector), (6, like)))
+    if not join:
+        told = (sums[:3], sums[3:], rest[0], rest[1], None if kin is None else rest[2:])
     inlier = None if observed.inlier is None else observed.inlier.contiguous()
     shared = (None, None) if kin is None else (kin.patch.to(like).contiguous(), kin.lasting.to(like).contiguous())
     look = (
@@ -79,8 +81,7 @@ def count_look(
     prior = memory.prior
     numbers = (prior.mean, prior.std, prior.bearing_std, prior.slope_std, fusion.conflict, fusion.window)
     settings = tuple(map(float, (*numbers, fusion.nearest_m)))
-    joined = (vector, matrix, bearing, None, None)
-    library("remember", look, before, after, joined if join else told, settings)
+    library("remember", look, before, after, told, settings)
     known = memory._replace(
         information=Information(vector.movedim(0, -1), matrix.movedim(0, -1)),
         bearing=bearing,

@@ -9,16 +9,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchfovea.compiling import is_compiling
 from torchfovea.gaussian import columns, definiteness
+from torchfovea.machine import loops
 from torchfovea.rounding import unrounded
 from torchfovea.sensing.camera import Camera, Pinhole
-from torchfovea.sensing.chart import Components, bilinear_moments, in_tangent_frame
+from torchfovea.sensing.chart import in_tangent_frame
 from torchfovea.sensing.correspondence import Correspondences, check_valid
 from torchfovea.sensing.head import Eyes, rig_frame
 from torchfovea.sensing.head import to_ego as turn
-from torchfovea.sensing.pinhole import fast_observations, weights_of
-from torchfovea.sensing.unscented import SigmaPoints, eye_root, moments, root_rows, sigma_components
+from torchfovea.sensing.pinhole import form_moments, form_of, observe_by_loops
+from torchfovea.sensing.two_rays import EyePair, Moments, placed, rectified, turned
+from torchfovea.sensing.unscented import SigmaPoints, moments, root_rows, sigma_components
 from torchfovea.setting import require
 
 __all__ = ["Observations", "observe", "triangulate", "triangulate_rectified"]
@@ -46,12 +47,6 @@ class Observations(NamedTuple):
     valid: Tensor
     inlier: Tensor | None = None
     chart: str = "inverse_range"
-
-
-def _turned(rotation: Tensor, vector: Components) -> Components:
-    """`torchfovea.sensing.head.to_ego` by components: R v, rotation (..., 3, 3) and v's (*any, ..., N)."""
-    row = [[rotation[..., i, j].unsqueeze(-1) for j in range(3)] for i in range(3)]
-    return tuple(torch.addcmul(torch.addcmul(r[2] * vector[2], r[0], vector[0]), r[1], vector[1]) for r in row)
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
@@ -116,35 +111,11 @@ def triangulate_rectified(left: Tensor, right: Tensor, baseline_m: Tensor) -> tu
 
     Differentiable.
     """
-    (x, y, z), w, least = _rectified(left.unbind(-1), right.unbind(-1))
+    (x, y, z), w, least = rectified(left.unbind(-1), right.unbind(-1))
     half, ahead = baseline_m / 2, least > 0
     seen = ahead[..., None]
     point = columns(half * x, half * y, half * z)
     return torch.where(seen, point, torch.ones_like(point)), torch.where(ahead, w, torch.ones_like(w)), ahead
-
-
-def _rectified(left: Components, right: Components) -> tuple[Components, Tensor, Tensor]:
-    """2 X/b and w of `triangulate_rectified`, and how far ahead the rays look (> 0: both do)."""
-    xl, yl, zl = left
-    xr, yr, zr = right
-    across, back = xl * zr, xr * zl
-    return (
-        (across + back, torch.addcmul(yl * zr, yr, zl), 2 * (zl * zr)),
-        across - back,
-        torch.minimum(zl, zr),
-    )
-
-
-class _Rig(NamedTuple):
-    """The rig's frame, origin and baseline (see `rig_frame`), the eyes' rotations into that frame and their cameras."""
-
-    frame: Tensor
-    origin: Tensor
-    baseline: Tensor
-    left: Tensor
-    right: Tensor
-    left_camera: Camera
-    right_camera: Camera
 
 
 @unrounded
@@ -175,47 +146,59 @@ def observe(
         covariance is positive definite.
 
     Raises:
-        SettingError: for an unknown chart.
+        SettingError: for an unknown chart, or sigma points of other than four dimensions.
 
     Differentiable in the correspondences, their sigmas and the poses.
     """
     require(chart in ("inverse_range", "cartesian"), "chart", chart, "inverse_range or cartesian")
     check_valid(matches)
     points = points or (SigmaPoints.midpoint() if chart == "cartesian" else SigmaPoints())
+    require(len(points.weights[0]) == 9, "points.dimensions", points.dimensions, "4, two places' coordinates")
     batch, count = matches.valid.shape[:-1], matches.valid.shape[-1]
     eyes = Eyes(*(part.expand(*batch, *part.shape[-k:]) for part, k in zip(eyes, (2, 1, 2, 1), strict=True)))
-    frame, origin, baseline = rig_frame(eyes)
     cameras = camera if isinstance(camera, tuple) else (camera, camera)
-    rig = _Rig(frame, origin, baseline, frame.mT @ eyes.R_left, frame.mT @ eyes.R_right, *cameras)
-    form = None
+    left, right = cameras
+    pinholes = None
+    if chart == "inverse_range" and isinstance(left, Pinhole) and isinstance(right, Pinhole):
+        pinholes = left, right
+        library = loops(*matches[:4], *eyes, support_px)
+        found = library and observe_by_loops(library, matches, eyes, pinholes, support_px, points, rotated)
+        if found:
+            value, direction, support, valid = found
+            return _observations(matches, value, direction, support, valid, chart)
+    frame, origin, baseline = rig_frame(eyes)
+    rig = EyePair(frame, origin, baseline, frame.mT @ eyes.R_left, frame.mT @ eyes.R_right, *cameras)
     transform = partial(_transform, rig=rig, points=points, chart=chart, rotated=rotated)
-    if chart == "inverse_range" and isinstance(cameras[0], Pinhole) and isinstance(cameras[1], Pinhole):
-        form = _form(rig, cameras[0], cameras[1])
-        transform = partial(_transform_form, form=form, points=points, rotated=rotated)
+    if pinholes is not None:
+        transform = partial(form_moments, form=form_of(rig, *pinholes), points=points, rotated=rotated)
     learning = torch.is_grad_enabled() and any(t.requires_grad for t in (*matches[:4], *eyes))
     if learning:
         matches = _safe(matches, cameras, transform)
-    block = BLOCK if form is not None else -(-BLOCK // 2)
+    block = BLOCK if pinholes is not None else -(-BLOCK // 2)
     blocks = max(1, round(matches.valid.numel() / (block * torch.get_num_threads())))
     size = count if learning or matches.valid.device.type != "cpu" else -(-count // blocks)
     parts = []
-    if form is not None and is_compiling() and not learning:
-        arguments = (*matches[:2], (matches[2], matches[3]), matches.valid, form, weights_of(points), rotated)
-        parts = [fast_observations(*arguments)]
-    for start in () if parts else range(0, max(count, 1), max(size, 1)):
+    for start in range(0, max(count, 1), max(size, 1)):
         axes = zip(matches[:5], (-2, -2, -1, -1, -1), strict=True)
         part = Correspondences(*(t.narrow(axis, start, min(size, count - start)) for t, axis in axes))
         parts.append(_settled(part, *transform(part)))
     value, direction, valid = (p[0] if len(p) == 1 else torch.cat(p, -1) for p in zip(*parts, strict=True))
-    x, y, z = cameras[0].ray_components(*matches.left_px.unbind(-1))
-    support = support_px / cameras[0].focal_px * torch.addcmul(torch.addcmul(z * z, x, x), y, y).rsqrt()
+    x, y, z = left.ray_components(*matches.left_px.unbind(-1))
+    support = support_px / left.focal_px * torch.addcmul(torch.addcmul(z * z, x, x), y, y).rsqrt()
+    return _observations(matches, value, direction, support.expand(valid.shape), valid, chart)
+
+
+def _observations(
+    matches: Correspondences, value: Tensor, direction: Tensor, support: Tensor, valid: Tensor, chart: str
+) -> Observations:
+    """What components (9, ..., N) and (3, ..., N) say."""
     mean, cov = value[:3].movedim(0, -1), value[3:].movedim(0, -1)
     inlier = valid.to(mean.dtype) if matches.inlier is None else matches.inlier
-    return Observations(mean, cov, direction.movedim(0, -1), support.expand(valid.shape), valid, inlier, chart)
+    return Observations(mean, cov, direction.movedim(0, -1), support, valid, inlier, chart)
 
 
 def _safe(
-    matches: Correspondences, cameras: tuple[Camera, Camera], transform: Callable[[Correspondences], _Moments]
+    matches: Correspondences, cameras: tuple[Camera, Camera], transform: Callable[[Correspondences], Moments]
 ) -> Correspondences:
     """Ordinary values in place of those that will not be valid, whose gradients might not be finite even times 0."""
     with torch.no_grad():
@@ -226,17 +209,12 @@ def _safe(
     return Correspondences(left, right, sigma_l, sigma_r, keep, matches.inlier)
 
 
-# of the images of the sigma points: mean and covariance by components, the direction of the central one (3, ..., N),
-# and a number that is positive where all of them are in front
-_Moments = tuple[list[Tensor], list[Tensor], Tensor, Tensor]
-
-
-def _transform(matches: Correspondences, rig: _Rig, points: SigmaPoints, chart: str, rotated: bool) -> _Moments:
+def _transform(matches: Correspondences, rig: EyePair, points: SigmaPoints, chart: str, rotated: bool) -> Moments:
     """The transform point by point (Eq. 10-18), for any camera and chart."""
     root = root_rows(matches.left_sigma_px, matches.right_sigma_px, rotated)
     places = sigma_components((*matches.left_px.unbind(-1), *matches.right_px.unbind(-1)), root, points)
-    left = _turned(rig.left, rig.left_camera.ray_components(*places[:2]))
-    right = _turned(rig.right, rig.right_camera.ray_components(*places[2:]))
+    left = turned(rig.left, rig.left_camera.ray_components(*places[:2]))
+    right = turned(rig.right, rig.right_camera.ray_components(*places[2:]))
     if chart == "cartesian":
         zero = torch.zeros_like(rig.baseline)
         half = torch.stack([rig.baseline / 2, zero, zero], -1).unsqueeze(-2)
@@ -244,63 +222,13 @@ def _transform(matches: Correspondences, rig: _Rig, points: SigmaPoints, chart: 
         point = turn(rig.frame, point) + rig.origin.unsqueeze(-2)
         direction = point[0] * (point[0] * point[0]).sum(-1, keepdim=True).rsqrt()
         return *moments(point.unbind(-1), points), direction.movedim(-1, 0), both.all(0).to(direction.dtype)
-    x, w, least = _rectified(left, right)
-    x = _placed(rig, x, w := w * (2 / rig.baseline.unsqueeze(-1)))
+    x, w, least = rectified(left, right)
+    x = placed(rig, x, w := w * (2 / rig.baseline.unsqueeze(-1)))
     direction = torch.stack([c[0] for c in x])
     direction = direction * (direction * direction).sum(0).rsqrt()
     a, b, ahead = in_tangent_frame(direction.unbind(0), x)
     rho = w * torch.addcmul(torch.addcmul(x[0] * x[0], x[1], x[1]), x[2], x[2]).rsqrt()
     return *moments((a / ahead, b / ahead, rho), points), direction, least.amin(0)
-
-
-def _placed(rig: _Rig, x: Components, w: Tensor) -> Components:
-    """Homogeneous points from the rig's frame to E: R X + w t."""
-    origin = rig.origin.unsqueeze(-1).unbind(-2)
-    return tuple(torch.addcmul(c, w, o) for c, o in zip(_turned(rig.frame, x), origin, strict=True))
-
-
-class _Form(NamedTuple):
-    """Triangulation with pinhole eyes, whose rays are linear in (u, v, 1): a bilinear form of the two places.
-
-    Attributes:
-        point: coefficients, the homogeneous points (X, w) in E between the rays of the places' axes, (4, 3, 3, ..., 1).
-        left: coefficients of the left ray's depth in the rig's frame, (3, ..., 1).
-        right: of the right one's.
-    """
-
-    point: Tensor
-    left: Tensor
-    right: Tensor
-
-
-def _form(rig: _Rig, left_camera: Pinhole, right_camera: Pinhole) -> _Form:
-    left, right = left_camera.turned(rig.left), right_camera.turned(rig.right)
-    x, w, _ = _rectified(left.unsqueeze(-1).unbind(-3), right.unsqueeze(-2).unbind(-3))
-    w = (w * (2 / rig.baseline[..., None, None])).flatten(-2)
-    point = torch.stack([*_placed(rig, tuple(c.flatten(-2) for c in x), w), w])
-    point = point.unflatten(-1, (3, 3)).movedim((-2, -1), (1, 2)).unsqueeze(-1)
-    return _Form(point, *(ray[..., 2, :].movedim(-1, 0).unsqueeze(-1) for ray in (left, right)))
-
-
-def _affine(coefficients: Tensor | Components, u: Tensor, v: Tensor) -> Tensor:
-    return (coefficients[0] * u).addcmul_(coefficients[1], v).add_(coefficients[2])
-
-
-def _transform_form(matches: Correspondences, form: _Form, points: SigmaPoints, rotated: bool) -> _Moments:
-    """The same for pinhole eyes in inverse range, without forming the sigma points: see `bilinear_moments`."""
-    # the form is linear in either place, so that a place's axes u and v move the point by multiples of the form there
-    (u, v), (there_u, there_v) = matches.left_px.unbind(-1), matches.right_px.unbind(-1)
-    by_left = _affine(form.point.unbind(2), there_u, there_v)
-    by_right = _affine(form.point[:, :, :2].unbind(1), u, v)
-    by_both = torch.stack([form.point[:, 0, 0], form.point[:, 1, 1]], 1)
-    centre = torch.addcmul(by_left[:, 2], by_left[:, 0], u).addcmul_(by_left[:, 1], v)
-    root = eye_root(matches.left_sigma_px, matches.right_sigma_px, rotated)
-    # the depth of the ray nearest to the side: no column moves it by more than the larger of its two parts
-    depths = [
-        _affine(z, *place).sub_(z[:2].abs().amax(0) * eye.abs().amax(0), alpha=points.spread)
-        for z, place, eye in ((form.left, (u, v), root[0]), (form.right, (there_u, there_v), root[1]))
-    ]
-    return *bilinear_moments(centre, by_left[:, :2], by_right, by_both, *root, points), torch.minimum(*depths)
 
 
 def _settled(
