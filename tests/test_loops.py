@@ -55,9 +55,25 @@ def same(one, other, dtype=torch.float64):
 @pytest.mark.parametrize("rotated", [True, False])
 def test_a_loop_observes_as_the_definition(batch, points, rotated, dtype):
     matches, pose = matches_of(batch, 333, 1, dtype), pose_of(batch, dtype)
-    found = both(lambda: observe(matches, pose, CAMERA, torch.ones(333, dtype=dtype), points, "inverse_range", rotated))
+    camera = CAMERA if rotated else (dataclasses.replace(CAMERA, cx_px=3.0, cy_px=-2.0), CAMERA)
+    half = torch.linspace(1, 2, 333, dtype=dtype)
+    found = both(lambda: observe(matches, pose, camera, half, points, "inverse_range", rotated))
     assert 0.5 < float(found[0].valid.double().mean()) < 0.95
     same(*found, dtype)
+
+
+def test_eyes_at_one_place_are_told_by_the_loop_too():
+    pose = pose_of((2,), torch.float32)
+    pose.t_right[1] = pose.t_left[1]
+    for mode in ("off", "on"):
+        with compiling(mode), pytest.raises(SettingError, match=r"baseline_m = 0.*: expected eyes some distance"):
+            observe(matches_of((2,), 9, 1, torch.float32), pose, CAMERA, torch.ones(9))
+
+
+def test_sigma_points_of_other_than_two_places_are_refused():
+    told = matches_of((), 9, 1, torch.float32), pose_of((), torch.float32), CAMERA, torch.ones(9), SigmaPoints(3)
+    with pytest.raises(SettingError, match="dimensions = 3: expected 4"):
+        observe(*told)
 
 
 def scattered(batch, count, dtype, seed=0):
