@@ -246,6 +246,7 @@ def test_a_fisheye_of_opencvs_is_told(tmp_path):
         (lambda p: camchain(p, R, T, camera_model="omni"), "cam0.camera_model = omni: expected pinhole"),
         (lambda p: camera_info(p, K1, D1, R1, P1), "calibration_right = None: expected the right camera's camera_info"),
         (lambda p: written(p, {"a": 1, "b": 2}), "it has a, b"),
+        (lambda p: written(p, {"\ufffd\x00": 1, "\ufffdNUMPY": 2}), "it has none of their names$"),
         (lambda p: written(p, [1, 2]), "expected a calibration file"),
         (lambda p: p.with_name("gone"), "gone: expected an existing file"),
     ],

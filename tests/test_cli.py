@@ -8,10 +8,12 @@ import sys
 from pathlib import Path
 
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from joblib.externals.loky import get_reusable_executor
 
 import torchfovea
 from torchfovea.cli import COMMANDS, Command, main
+from torchfovea.commands.shared.mistakes import arranged
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -117,9 +119,28 @@ def test_flags_may_stand_anywhere_and_unknown_ones_are_named(job, capsys):
     for flags, said in (
         (["--hlp"], "--hlp: expected SETTING=VALUE, or a flag such as --help (did you mean --help?)"),
         (["seed=1", "--config-dir"], "--config-dir = nothing: expected a value after it"),
+        (["--config-dir", "nowhere"], "--config-dir = nowhere: expected an existing folder"),
+        (["hydra.run.dir="], "hydra.run.dir = nothing: expected a folder"),
     ):
         assert main(["doctor", *flags]) == 2
         assert capsys.readouterr().err == f"torchfovea doctor: {said}\n"
+
+
+@pytest.mark.parametrize("path", ["müde/l übung.png", "left (1).png", "片目.png", "plain.png"])
+def test_paths_need_no_quotes_that_a_shell_would_not_ask_for(path):
+    (setting,) = arranged([f"memory.load={path}"])
+    assert OverridesParser.create().parse_override(setting).value() == path
+
+
+@pytest.mark.parametrize("setting", ["a=[1", "a='x'", "a=${b}", "a=1,2", "a=", "~a", "a={b:1}", "a=x y", "a", "a=\\"])
+def test_what_hydra_means_is_left_to_it(setting):
+    assert arranged([setting]) == [setting]
+
+
+def test_several_values_without_a_sweep_are_named(job, capsys):
+    job("raise AssertionError('must not run')")
+    expected = "seed = 0,1: expected one value, a list [0,1], or --multirun, which runs each of them"
+    fails_with(capsys, expected, "seed=0,1")
 
 
 def test_a_broken_file_of_a_group_is_named(job, capsys, tmp_path):
@@ -280,7 +301,7 @@ def test_one_failing_job_does_not_stop_the_others(launcher, job, capfd, tmp_path
             "hydra.launcher.n_jobs=2",
             f"hydra.sweep.dir={tmp_path}/multirun/doctor/it",
         ]
-        failed = {"1": "probe_timeout_s = -1: expected a positive number"}
+        failed = {"1": "probe_timeout_s = -1: expected a positive number of seconds, at most 1e6"}
         count = 2
     else:
         sweep = ["seed=0,1,2,3"]
@@ -339,7 +360,7 @@ def test_doctor_names_a_probe_that_does_not_answer(tmp_path, monkeypatch, capsys
 def test_doctor_limit_must_be_a_time(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     fails_with(capsys, "probe_timeout_s = soon: expected a number", "probe_timeout_s=soon")
-    fails_with(capsys, "probe_timeout_s = -1: expected a positive number", "probe_timeout_s=-1")
+    fails_with(capsys, "probe_timeout_s = -1: expected a positive number of seconds, at most 1e6", "probe_timeout_s=-1")
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals are POSIX")

@@ -7,6 +7,7 @@ from omegaconf import OmegaConf
 from torchfovea.cli import main
 from torchfovea.commands.shared.build import build_match, build_motor, build_renderer, build_scene_of, build_sensor
 from torchfovea.commands.shared.config import conf_dir
+from torchfovea.commands.shared.rewards import build_reward
 from torchfovea.commands.shared.strategy import build_strategy
 from torchfovea.commands.shared.trust import load_trusted
 from torchfovea.imported import load_function, load_object
@@ -25,6 +26,23 @@ def one(*anything, **settings):
 
 def picky(size):
     return size
+
+def nobody():
+    return 1
+
+class Can:
+    def __init__(self, colour="red"):
+        self.colour = colour
+
+    def __call__(self, *anything):
+        return self.colour
+
+    def move(self, head, before, command):
+        return None
+
+class Dear:
+    def __init__(self, price):
+        self.price = price
 """
 
 BUILD = {
@@ -34,6 +52,7 @@ BUILD = {
     "sensor": build_sensor,
     "matcher": build_match,
     "acquisition": lambda cfg: build_strategy(cfg, Observer()),
+    "reward": build_reward,
 }
 
 
@@ -126,6 +145,50 @@ def test_a_scene_file_without_targets_is_still_ours():
 def test_the_wrong_thing_is_named(own, group):
     with pytest.raises(SettingError, match=f"^{group} = int"):
         BUILD[group](configured(f"{group}=external", f"{group}.source=own_things:one"))
+
+
+@pytest.mark.parametrize(
+    ("group", "source", "misfit"),
+    [
+        ("scene", "nobody", r"\(seed, head\): too many"),
+        ("renderer", "nobody", r"\(scene, R, t, camera, size_px\): too many"),
+        ("motor", "nobody", r"\(model\): too many"),
+        ("sensor", "picky", r"\(\): missing a required argument: 'size'"),
+        ("matcher", "nobody", r"\(views, retina, budget\): too many"),
+        ("matcher", "Dear", r"\(views, retina, budget\): too many"),
+        ("acquisition", "nobody", r"\(view\): too many"),
+        ("reward", "nobody", r"\(points\): too many"),
+    ],
+)
+def test_a_function_of_other_arguments_is_refused_before_the_run(own, group, source, misfit):
+    choice = "correspondences" if group == "matcher" else "external"
+    with pytest.raises(SettingError, match=f"= own_things:{source}: expected a function of {misfit}"):
+        BUILD[group](configured(f"{group}={choice}", f"{group}.source=own_things:{source}"))
+
+
+def test_a_matcher_of_two_images_is_asked_for_its_arguments_too(own):
+    with pytest.raises(SettingError, match=r"own_things:nobody: expected a function of \(left, right\)"):
+        build_match(configured("matcher=external", "matcher.source=own_things:nobody"))
+    network = build_match(configured("matcher=external", "matcher.source=own_things:Can")).source
+    assert network("left", "right") == "red"
+
+
+@pytest.mark.parametrize("group", ["renderer", "matcher", "acquisition", "reward", "motor"])
+def test_a_class_that_needs_nothing_is_made(own, group):
+    choice = "correspondences" if group == "matcher" else "external"
+    made = BUILD[group](configured(f"{group}={choice}", f"{group}.source=own_things:Can"))
+    assert getattr(made, "__wrapped__", made).colour == "red"
+
+
+@pytest.mark.parametrize("group", ["reward", "sensor"])
+def test_what_an_observer_has_can_be_hashed(own, group):
+    (own / "loose_things.py").write_text(
+        "from dataclasses import dataclass\n\n@dataclass\nclass Loose:\n    size: int = 1\n\n"
+        "    def __call__(self, points):\n        return points\n\ndef loose():\n    return Loose()\n"
+    )
+    source = "Loose" if group == "reward" else "loose"
+    with pytest.raises(SettingError, match=f"^{group} = Loose: .* hashed, such as a frozen dataclass"):
+        BUILD[group](configured(f"{group}=external", f"{group}.source=loose_things:{source}"))
 
 
 @pytest.mark.parametrize(

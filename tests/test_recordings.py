@@ -146,6 +146,15 @@ def test_a_table_by_hand_needs_three_columns(tmp_path):
     np.testing.assert_allclose(frames[2].base.translation.numpy(), turn.inv().apply([0.3, 0, 0]), atol=1e-12)
 
 
+def test_a_column_that_nothing_reads_is_refused(tmp_path):
+    """A misspelt angle would be missing, and so 0."""
+    written(tmp_path, 2)
+    table = tmp_path / "frames.csv"
+    table.write_text(table.read_text().replace("pan_rad", "pan_deg"))
+    with pytest.raises(SettingError, match=r"frames.csv: columns = pan_deg: expected none but time_s, .*pan_rad"):
+        Folder(tmp_path)
+
+
 @pytest.mark.parametrize(
     ("change", "line"),
     [

@@ -195,5 +195,7 @@ def test_what_is_refused():
     with pytest.raises(SettingError, match=r"reward\.method = exact"):
         rw.user_reward(rw.nearest_to(torch.zeros(3)), gaussian, "exact")
     for method in ("first_order", "unscented"):
+        with pytest.raises(SettingError, match="the user's reward = NaN or infinite values"):
+            rw.user_reward(lambda x: x[..., 0] * math.nan, gaussian, method)
         with pytest.raises(SettingError, match="shape of the user's reward"):
             rw.user_reward(lambda x: -x, gaussian, method)

@@ -80,6 +80,17 @@ def test_another_run_is_refused_and_touches_nothing(made, command, capsys):
     assert content(made) == before
 
 
+def test_the_settings_that_are_others_are_told(made, capsys):
+    assert main(["search", *TINY, "saccades=3", "seed=7", "workers=2", f"hydra.run.dir={made}"]) == 1
+    said = capsys.readouterr().err
+    assert "seed = 0, now 7" in said and "saccades = " in said and ", now 3" in said and "workers" not in said
+
+
+def test_a_complete_run_says_that_it_is_complete(made, capsys):
+    assert main(["search", *TINY, f"hydra.run.dir={made}"]) == 0
+    assert capsys.readouterr().out.startswith(f"complete since before, nothing is run again: {made / 'result.json'}\n")
+
+
 def test_the_same_settings_in_another_order_are_the_same_run(made, capsys):
     before = content(made)
     assert main(["search", *TINY[::-1], f"hydra.run.dir={made}"]) == 0

@@ -129,7 +129,8 @@ def test_offset_axes_are_the_same_geometry(folder, capsys, plane):
         (["left=left.png", "right=right.png"], "focal_px = null: expected the calibration"),
         (["left=left.png", "right=text.png"], "right = text.png: expected an image"),
         (["left=left.png", "right=nan.npy"], "NaN or infinite"),
-        (["OWN", "baseline_m=0"], "baseline_m = 0: expected a positive number"),
+        (["OWN", "baseline_m=0"], "baseline_m = 0: expected 0.001 to 10 metres"),
+        (["OWN", "baseline_m=193"], "baseline_m = 193: expected 0.001 to 10 metres"),
         (["OWN", "focal_px=wide"], "focal_px = wide: expected a number"),
         (
             ["OWN", "disparity=left.png"],
@@ -141,7 +142,7 @@ def test_offset_axes_are_the_same_geometry(folder, capsys, plane):
         (["OWN", "cy_px=1e9"], "cy_px = 1000000000.0: expected a number of pixels within 100 images"),
         (["OWN", "focal_px=1e300"], "focal_px = 1e+300: expected a positive number of pixels"),
         (["OWN", "focal_px=1e-300"], "focal_px = 1e-300: expected a positive number of pixels"),
-        (["OWN", "baseline_m=1e300"], "baseline_m = 1e+300: expected a positive number of metres"),
+        (["OWN", "baseline_m=1e300"], "baseline_m = 1e+300: expected 0.001 to 10 metres"),
         (["OWN", "doffs_px=null"], "doffs_px = None: expected a number"),
         (["OWN", "doffs_px=[]"], "doffs_px = []: expected a number"),
         (["OWN", "doffs_px=1e9"], "doffs_px = 1000000000.0: expected a number of pixels within"),

@@ -119,12 +119,13 @@ def _run(command: str, overrides: list[str]) -> int:
 
     from torchfovea.allocation import keep_memory
     from torchfovea.commands.shared.config import SweepFolder, conf_dir, help_text
-    from torchfovea.commands.shared.mistakes import arranged, describe
+    from torchfovea.commands.shared.mistakes import arranged, check_folders, describe
     from torchfovea.commands.shared.trust import refuse_foreign
     from torchfovea.setting import SettingError
 
     try:
         overrides = arranged(overrides)
+        check_folders(overrides)
     except SettingError as error:
         _complain(f"torchfovea {command}", str(error))
         return 2

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import importlib
+import inspect
+from collections.abc import Sequence
 from typing import Any
 
 from torchfovea.setting import SettingError, require
 
-__all__ = ["load_function", "load_object"]
+__all__ = ["load_function", "load_object", "made_if_class", "require_takes"]
 
 
 def load_function(source: object, setting: str, form: str = "package.module:function") -> Any:
@@ -31,6 +33,38 @@ def load_function(source: object, setting: str, form: str = "package.module:func
         found = getattr(found, part, None)
     require(callable(found), setting, source, f"a function {name} in {module}")
     return found
+
+
+def made_if_class(found: Any) -> Any:
+    """An object of a class that needs no arguments, to be called in the class's place; anything else as it is."""
+    return found() if isinstance(found, type) and _misfit(found, ()) is None else found
+
+
+def require_takes(found: Any, arguments: Sequence[str], setting: str, source: object) -> None:
+    """Refuse a user's function that cannot be called as it will be, before anything else is done.
+
+    Args:
+        found: the function.
+        arguments: names of what it will be given, in order.
+        setting: what it is the value of.
+        source: what the user calls it.
+
+    Raises:
+        SettingError: where it takes fewer arguments, or more that have no default.
+    """
+    misfit = _misfit(found, arguments)
+    require(misfit is None, setting, source, f"a function of ({', '.join(arguments)}): {misfit}")
+
+
+def _misfit(found: Any, arguments: Sequence[str]) -> str | None:
+    """Why something cannot be called with so many arguments; None: it can, or does not tell."""
+    try:
+        inspect.signature(found).bind(*arguments)
+    except TypeError as error:
+        return str(error)
+    except ValueError:  # some functions written in C tell nothing
+        return None
+    return None
 
 
 def load_object(target: object, setting: str) -> Any:

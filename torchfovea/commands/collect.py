@@ -10,7 +10,7 @@ from rich.table import Table
 
 from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.manifest import MANIFEST, read_result, unchanged
-from torchfovea.commands.shared.screen import say, wide_screen
+from torchfovea.commands.shared.screen import in_words, say, wide_screen
 from torchfovea.files import write_csv, write_result
 from torchfovea.setting import SettingError, require
 
@@ -52,7 +52,7 @@ def _show(columns: list[str], rows: list[dict[str, Any]]) -> None:
     table = Table(*words, *figures, box=None, padding=(0, 2, 0, 0))
     for row in rows:
         cells = (row.get(c) for c in (*words, *figures))
-        table.add_row(*("-" if v is None else f"{v:.4g}" if isinstance(v, float) else str(v) for v in cells))
+        table.add_row(*map(in_words, cells))
     wide_screen().print(table, markup=False)
     print(f"collect.csv: {len(rows)} runs, {len(columns)} columns")
 

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchfovea.finite import require_finite
 from torchfovea.gaussian import Gaussian, columns, quadratic3
 from torchfovea.sensing.unscented import SigmaPoints, unscented_transform
 from torchfovea.setting import require
@@ -128,7 +129,8 @@ def user_reward(function: Callable[[Tensor], Tensor], gaussian: Gaussian, method
         Mean and std (...). Differentiable where the function is (twice, for first order).
 
     Raises:
-        SettingError: an unknown method, or a function whose result does not have the shape (...).
+        SettingError: an unknown method, or a function whose result does not have the shape (...) or is not finite
+            (`torchfovea.finite.require_finite`).
     """
     require(method in ("first_order", "unscented"), "reward.method", method, "first_order or unscented")
     mean, cov = gaussian
@@ -138,6 +140,7 @@ def user_reward(function: Callable[[Tensor], Tensor], gaussian: Gaussian, method
             return _checked(function(points), points)[..., None]
 
         moments = unscented_transform(column, mean, _cholesky3(cov), SigmaPoints(3, alpha=1.0, beta=0.0, kappa=0.0))
+        require_finite(moments[0], "the user's reward", "a finite number for every point")
         return RewardBelief(moments[0][..., 0], _root(moments[1][..., 0]))
 
     def total(points: Tensor) -> tuple[Tensor, Tensor]:
@@ -145,6 +148,8 @@ def user_reward(function: Callable[[Tensor], Tensor], gaussian: Gaussian, method
         return reward.sum(), reward
 
     jacobian, reward = torch.func.grad(total, has_aux=True)(mean)
+    require_finite(reward, "the user's reward", "a finite number for every point")
+    require_finite(jacobian, "the user's reward's derivative", "a finite number for every point")
     return RewardBelief(reward, _root(quadratic3(cov, jacobian)))
 
 

@@ -32,6 +32,7 @@ __all__ = ["COLUMNS", "Folder", "Recorder"]
 _IMAGES = ("time_s", "left", "right")
 _JOINTS = ("pan_rad", "tilt_rad", "vergence_rad")
 _PLACE, _TURN = ("x_m", "y_m", "z_m"), ("qw", "qx", "qy", "qz")
+_YAW = "yaw_rad"
 _AXES = ("rx", "ry", "rz", "x", "y", "z")  # of a step's error, as in `torchfovea.memory.moving.Motion`
 _PAIRS = [(i, j) for i in range(6) for j in range(i, 6)]
 _COVARIANCE = tuple(f"cov_{_AXES[i]}_{_AXES[j]}" for i, j in _PAIRS)
@@ -109,7 +110,8 @@ class Folder:
             missing then.
 
     Raises:
-        SettingError: for a folder without frames.csv or calibration.json, or a table without its columns.
+        SettingError: for a folder without frames.csv or calibration.json, or a table without its columns, or with
+            others.
     """
 
     def __init__(self, folder: str | os.PathLike[str], cameras: Cameras | None = None) -> None:
@@ -127,7 +129,10 @@ class Folder:
         require(
             not missing, f"{self._table}: columns", ", ".join(given), f"{', '.join(_IMAGES)}, and what else is known"
         )
-        turn = set(_TURN) <= set(given) or "yaw_rad" in given
+        unknown = [name for name in given if name not in (*COLUMNS, _YAW)]  # missing is 0: a misspelt one is not
+        of_these = ", ".join((*_IMAGES, *_JOINTS, *_PLACE, *_TURN, _YAW, _COVARIANCE[0]))
+        require(not unknown, f"{self._table}: columns", ", ".join(map(str, unknown)), f"none but {of_these}, ...")
+        turn = set(_TURN) <= set(given) or _YAW in given
         self._moves = {"x_m", "y_m"} <= set(given) and turn
         require(bool(self._rows), "recording", self._table, "at least one frame")
         told = self.folder / "calibration.json"
@@ -205,7 +210,7 @@ def _pose(row: Mapping[str, str | None]) -> Pose:
     if row.get("qw"):
         quaternion = [_number(row, name) for name in _TURN]
     else:
-        half = _number(row, "yaw_rad") / 2
+        half = _number(row, _YAW) / 2
         quaternion = [math.cos(half), 0.0, 0.0, math.sin(half)]
     return Pose(matrix_from_quaternion(torch.tensor(quaternion, dtype=torch.float64)), place)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Hashable
 
 import torch
 from torch import Tensor
@@ -21,11 +22,10 @@ def check_retina(retina: object, setting: str = "sensor") -> Retina:
             do not come narrow ones first.
     """
     name = type(retina).__name__
-    require(
-        isinstance(retina, Retina), setting, name, "a layout with count, radius_px, centers_px, width_px and inside"
-    )
+    parts = "a layout with count, radius_px, centers_px, width_px and inside"
+    require(isinstance(retina, Hashable), setting, name, f"{parts} that can be hashed, such as a frozen dataclass")
+    require(isinstance(retina, Retina), setting, name, parts)
     assert isinstance(retina, Retina)
-    hash(retina)
     require(0 < retina.radius_px < math.inf, f"{setting}.radius_px", retina.radius_px, "a positive number of pixels")
     px = retina.centers_px("cpu", torch.float64)
     fits = isinstance(px, Tensor) and px.dtype == torch.float64 and px.shape == (retina.count, 2)

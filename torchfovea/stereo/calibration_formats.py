@@ -99,9 +99,10 @@ def described(paths: Sequence[Path], options: Options) -> Told:
         if isinstance(error, SettingError):
             raise SettingError(str(error) if where in str(error) else f"calibration = {where}: {error}") from error
         raise SettingError(f"calibration = {where}: expected numbers of a calibration ({error})") from error
+    names = [name[:20] for name in map(str, whole) if name.isascii() and name.isprintable()]
     raise SettingError(
         f"calibration = {where}: expected Middlebury's or KITTI's calib.txt, OpenCV's YAML or XML, ROS's camera_info "
-        f"or Kalibr's camchain; it has {', '.join(str(name)[:20] for name in list(whole)[:6]) or 'nothing'}"
+        f"or Kalibr's camchain; it has {', '.join(names[:6]) or 'none of their names'}"
     )
 
 

@@ -12,6 +12,7 @@ from rich.table import Table
 from torch import Tensor
 
 from torchfovea.commands.shared.regions import REGIONS
+from torchfovea.commands.shared.screen import print_figures
 from torchfovea.sensing.correspondence import Budget
 from torchfovea.studies.calibration import Judged, inlier_of, judge, reliability, select, sigma_of
 
@@ -86,14 +87,14 @@ def table(
 def print_judgements(figures: Mapping[str, Any], models: Mapping[str, list[str]]) -> None:
     """The most telling figures by area on the screen, a row for each judgement; then the fitted numbers."""
     first = next(iter(models))
-    grid = Table("by area", "", *(name.replace("_", " ") for name in SHOWN), box=None)
+    heads = (name.replace("_", " ") for name in SHOWN)
+    grid = Table("by area", "", *heads, box=None, padding=(0, 1, 0, 0))  # 80 columns hold it
     for kind, laws in models.items():
         for model in laws:
             prefix = ("" if kind == first else f"{kind}.") + model
             grid.add_row(kind, model, *(f"{figures[f'{prefix}.{name}_by_area']:.3g}" for name in SHOWN))
-    console = Console()
-    console.print(grid)
-    console.print("  ".join(f"{k.removeprefix('fit.')} {v:.4g}" for k, v in figures.items() if k.startswith("fit.")))
+    Console().print(grid)
+    print_figures({name.removeprefix("fit."): figure for name, figure in figures.items() if name.startswith("fit.")})
 
 
 def _within(values: Tensor, edges: tuple[float, float] | None) -> Tensor:

@@ -13,7 +13,7 @@ from torchfovea.commands.shared.build import build_arena, build_cells, build_obs
 from torchfovea.commands.shared.config import run_folder
 from torchfovea.commands.shared.memories import aimed, loaded_memory, memory_path
 from torchfovea.commands.shared.rehearsal import rehearse
-from torchfovea.commands.shared.screen import print_figures, wide_screen
+from torchfovea.commands.shared.screen import in_words, print_figures, wide_screen
 from torchfovea.commands.shared.settings import choice, number, whole
 from torchfovea.files import write_csv, write_result
 from torchfovea.memory.nearest import neighbour_spacing_rad
@@ -84,7 +84,7 @@ def _study(cfg: DictConfig, name: str) -> float:
     for column in rows.columns[:shown]:
         table.add_column(column, justify="right")
     for row in rows.rows:
-        table.add_row(*("-" if v is None else f"{v:.4g}" if isinstance(v, float) else str(v) for v in row[:shown]))
+        table.add_row(*map(in_words, row[:shown]))
     wide_screen().print(table)
     write_result(folder, rows.figures())
     return float(len(rows.rows))

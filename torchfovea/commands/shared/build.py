@@ -13,7 +13,7 @@ from torchfovea.commands.shared.budgets import build_budget
 from torchfovea.commands.shared.named import build_named, name_of, targets_of
 from torchfovea.commands.shared.rewards import build_classes, build_reward
 from torchfovea.commands.shared.settings import changed, choice, construct, number, plain, whole
-from torchfovea.imported import load_function
+from torchfovea.imported import load_function, made_if_class, require_takes
 from torchfovea.memory import sphere
 from torchfovea.memory.egosphere import Fusion, Prior
 from torchfovea.perception import Eligibility, Observer
@@ -66,9 +66,10 @@ def build_sensor(cfg: DictConfig) -> tuple[Camera, Retina]:
     """The eyes' camera, in retinal pixels, and their retina."""
     every = name_of(cfg, "sensor", "layout") == "every_pixel"
     require(not every, "sensor.layout", "every_pixel", "a retina; every pixel is for sense alone")
-    made = build_named(cfg, "sensor", "a layout of receptive fields", SENSOR, "layout")
-    # what a source names is a function without arguments that makes the layout
-    retina = check_retina(made() if OmegaConf.select(cfg, "sensor.source") is not None else made, "sensor")
+    made = build_named(cfg, "sensor", "a layout of receptive fields", SENSOR, "layout", ())
+    # what a source names may be a function that makes the layout
+    maker = callable(made) and not hasattr(made, "centers_px")
+    retina = check_retina(made() if maker else made, "sensor")
     return build_camera(cfg, retina.radius_px), retina
 
 
@@ -109,7 +110,9 @@ def build_head(cfg: DictConfig) -> Any:
         return construct(Head, cfg.head, "head")
     form = "package.module:function, a function without arguments that returns a torchfovea.sensing.head.Kinematics"
     require(cfg.head.source is not None, "head.source", None, form)
-    head = load_function(cfg.head.source, "head.source")()
+    maker = load_function(cfg.head.source, "head.source")
+    require_takes(maker, (), "head.source", cfg.head.source)
+    head = maker()
     require(isinstance(head, Head | Kinematics), "head", type(head).__name__, form)
     return head
 
@@ -150,14 +153,15 @@ def build_scene_of(cfg: DictConfig, head: Head, seed: int) -> Scene:
     name_of(cfg, "scene")
     if "room" in cfg.scene and "_target_" not in cfg.scene.room:  # as scene files were before _target_
         cfg = changed(cfg, {"scene": {"room": {"_target_": f"{Room.__module__}.{Room.__name__}"}}})
-    return build_scene(build_named(cfg, "scene", "a function (seed, head) that returns a Scene"), seed, head)
+    form = "a function (seed, head) that returns a Scene"
+    return build_scene(build_named(cfg, "scene", form, takes=("seed", "head")), seed, head)
 
 
 def build_renderer(cfg: DictConfig) -> Renderer:
     """What draws the pictures."""
     name_of(cfg, "renderer")
     form = "a function (scene, R, t, camera, size_px) that returns a Frame"
-    renderer: Renderer = build_named(cfg, "renderer", form)
+    renderer: Renderer = build_named(cfg, "renderer", form, takes=("scene", "R", "t", "camera", "size_px"))
     require(callable(renderer), "renderer", type(renderer).__name__, form)
     return renderer
 
@@ -176,11 +180,13 @@ def build_motor(cfg: DictConfig) -> Callable[[Scene], Motor]:
     name_of(cfg, "motor")
     form = "a motor that has move(head, before, command), or a function of the scene's MuJoCo model that returns one"
     made = build_named(cfg, "motor", form)
-    moves = callable(getattr(made, "move", None))
+    moves = callable(getattr(made, "move", None)) and not isinstance(made, type)
     require(moves or callable(made), "motor", type(made).__name__, form)
+    if not moves:
+        require_takes(made, ("model",), "motor", cfg.motor.get("source") or cfg.motor.name)
 
     def motor_of(scene: Scene) -> Motor:
-        motor: Motor = made if moves and not isinstance(made, type) else made(scene.model)
+        motor: Motor = made if moves else made(scene.model)
         require(callable(getattr(motor, "move", None)), "motor", type(motor).__name__, form)
         return motor
 
@@ -242,14 +248,16 @@ def build_match(cfg: DictConfig, observer: Observer | None = None) -> Match:
     form = "a function (views, retina, budget) that returns (Correspondences, found)"
     target = OmegaConf.select(cfg, "matcher._target_") or targets_of("matcher", "name").get(cfg.matcher.name)
     ours = isinstance(target, str) and target.startswith("torchfovea.")
-    made = build_named(cfg, "matcher", form, MATCHER if ours else ("name",))
+    made = build_named(cfg, "matcher", form, MATCHER if ours else ("name",), takes=("views", "retina", "budget"))
     if isinstance(made, SGBM | Sweep | External):
         source = cfg.matcher.get("source")
         if isinstance(source, DictConfig):
             source = build_named(cfg, "matcher.source", "a function (left, right) that returns a disparity", ())
             require(callable(source), "matcher.source", type(source).__name__, "a function (left, right)")
         if isinstance(made, External):  # whoever has a memory has two eyes, and no rectified pair
-            resolve_source(source, files=observer is None)
+            source = made_if_class(resolve_source(source, files=observer is None))
+            if callable(source):
+                require_takes(source, ("left", "right"), "matcher.source", cfg.matcher.source)
         matcher = Matcher(made, number(cfg, "matcher.nearest_range_m"), source)
         knows = observer is not None and observer.fusion.votes
         expected = "all, or search with fusion=inverse_range, whose memory tells where to look"

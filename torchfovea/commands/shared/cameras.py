@@ -8,7 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 from torchfovea.commands.shared.settings import choice, within
 from torchfovea.sensing.camera import Pinhole
 from torchfovea.setting import SettingError, require
-from torchfovea.stereo.calibration_files import KINDS, Options, StereoCalibration, load_calibration
+from torchfovea.stereo.calibration_files import BASELINES_M, KINDS, Options, StereoCalibration, load_calibration
 from torchfovea.stereo.calibration_formats import LENSES
 from torchfovea.stereo.rig import StereoRig
 
@@ -67,7 +67,7 @@ def _by_hand(cfg: DictConfig, size_px: tuple[int, int]) -> StereoCalibration:
                 "calibration=FILE"
             )
     focal = within(cfg, "focal_px", 1.0, 1e6, "a positive number of pixels, 1 to 1e6")
-    baseline = within(cfg, "baseline_m", 1e-6, 1e4, "a positive number of metres, 1e-6 to 1e4")
+    baseline = within(cfg, "baseline_m", *BASELINES_M, "{:g} to {:g} metres".format(*BASELINES_M))
     reach = 100.0 * max(size_px)
     near = f"a number of pixels within 100 images, {-reach:g} to {reach:g}"
     cx, cy, doffs = (within(cfg, name, -reach, reach, near) for name in ("cx_px", "cy_px", "doffs_px"))

@@ -32,6 +32,8 @@ __all__ = [
 MANIFEST = "manifest.json"
 # what holds figures, and is read again
 DATA = (".csv", ".json", ".yaml")
+# settings that are told apart in one line
+NAMED = 3
 # what does not change a run's figures
 INCIDENTAL = ("workers", "backend", "device", "batch", "picture", "trust")
 
@@ -78,9 +80,9 @@ def finished(cfg: DictConfig, folder: Path, score: str = "gap_per_saccade") -> f
             return None
     before = _read_manifest(manifest)
     if before["config_hash"] != made_with:
+        others = _others(before, cfg) or f"{before['config_hash']}, now {made_with}"
         raise SettingError(
-            f"{folder} = made with other settings ({before['config_hash']}, now {made_with}): expected the same "
-            "settings, another folder, or none"
+            f"{folder} = made with other settings ({others}): expected the same settings, another folder, or none"
         )
     if not result.exists():
         clear_unfinished(folder)
@@ -90,7 +92,26 @@ def finished(cfg: DictConfig, folder: Path, score: str = "gap_per_saccade") -> f
     whole = score in figures and (value is None or isinstance(value, int | float))
     require(whole, f"{result}: {score}", value, "a number; remove the file to run again")
     unchanged(folder)
+    print(f"complete since before, nothing is run again: {result}")
     return float("nan") if value is None else float(value)
+
+
+def _others(before: Mapping[str, Any], cfg: DictConfig) -> str:
+    """The first settings that are not those of a manifest, with both values."""
+    was, now = (
+        _flat(json.loads(json_text(s))) for s in (before.get("settings"), OmegaConf.to_container(cfg, resolve=True))
+    )
+    names = [n for n in {**was, **now} if was.get(n) != now.get(n) and n.partition(".")[0] not in INCIDENTAL]
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(f"{name} = {was.get(name)}, now {now.get(name)}" for name in names[:NAMED]) + more
+
+
+def _flat(settings: Any, prefix: str = "") -> dict[str, Any]:
+    """Settings by their dotted names."""
+    found: dict[str, Any] = {}
+    for key, value in settings.items() if isinstance(settings, dict) else ():
+        found |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return found
 
 
 def complete(folder: Path, figures: Mapping[str, Any]) -> None:

@@ -6,9 +6,12 @@ import difflib
 import importlib.util
 import re
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import (
     HydraException,
     InstantiationException,
@@ -29,7 +32,7 @@ from yaml import YAMLError
 from torchfovea.commands.shared.extras import extra_of, install
 from torchfovea.setting import SettingError, require
 
-__all__ = ["arranged", "closest", "describe", "need", "setting_names"]
+__all__ = ["arranged", "check_folders", "closest", "describe", "need", "setting_names"]
 
 # Hydra's own flags: with a value, and without
 VALUED = ("--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd", "--package", "-p", "--cfg", "-c",
@@ -62,7 +65,7 @@ def arranged(arguments: Sequence[str]) -> list[str]:
         argument = rest.pop(0)
         name, equals, _ = argument.partition("=")
         if not argument.startswith("-"):
-            settings.append(argument)
+            settings.append(_quoted(argument))
         elif name in VALUED:
             require(bool(equals or rest), name, "nothing", "a value after it")
             flags += [argument] if equals else [argument, rest.pop(0)]
@@ -76,6 +79,36 @@ def arranged(arguments: Sequence[str]) -> list[str]:
                 )
             flags.append(argument)
     return [*flags, *settings]
+
+
+def check_folders(arguments: Sequence[str]) -> None:
+    """Look at the folders that Hydra would pass over in silence, or put the current one in place of.
+
+    Args:
+        arguments: arranged.
+
+    Raises:
+        SettingError: for a folder of configurations that is none, and for a run's folder without a name.
+    """
+    for k, argument in enumerate(arguments):
+        name, equals, value = argument.partition("=")
+        if name in ("--config-dir", "-cd"):
+            value = value if equals else arguments[k + 1]
+            require("://" in value or Path(value).is_dir(), name, value, "an existing folder")
+        require(argument != "hydra.run.dir=", "hydra.run.dir", "nothing", "a folder")
+
+
+def _quoted(argument: str) -> str:
+    """A setting whose value Hydra's grammar does not know, a file's name with umlauts say, as quoted text."""
+    name, equals, value = argument.partition("=")
+    if not value or value[0] in "[{" or set("'\"\\$") & set(value):
+        return argument
+    parser = OverridesParser.create()
+    for written in (argument, f'{name}{equals}"{value}"'):
+        with suppress(HydraException):
+            parser.parse_override(written)
+            return written
+    return argument
 
 
 def need(*modules: str) -> None:
@@ -178,6 +211,9 @@ def _composition(error: HydraException, overrides: Sequence[str], known: Iterabl
         return f"{_given(unknown[1], overrides)}: expected a known setting{closest(unknown[1], known)}"
     if merged := re.match(r"Error merging override [+~]*([^=@]+)", str(error)):  # a mapping for a list, and the like
         return f"{_given(merged[1], overrides)}: expected a value of the kind that the setting has"
+    if several := re.match(r"Ambiguous value for argument '([^=]+)=(.*)'", str(error)):
+        name, value = several.groups()
+        return f"{name} = {value}: expected one value, a list [{value}], or --multirun, which runs each of them"
     return _first_line(error)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 from torchfovea.commands.shared.config import conf_dir
 from torchfovea.commands.shared.settings import construct, plain
 from torchfovea.commands.shared.trust import load_trusted
-from torchfovea.imported import load_function
+from torchfovea.imported import load_function, made_if_class, require_takes
 from torchfovea.setting import SettingError, require, require_name
 
 __all__ = ["build_named", "name_of", "targets_of"]
@@ -60,7 +60,14 @@ def targets_of(group: str, key: str) -> dict[str, str | None]:
     return found
 
 
-def build_named(cfg: DictConfig, group: str, form: str, without: Collection[str] = ("name",), key: str = "name") -> Any:
+def build_named(
+    cfg: DictConfig,
+    group: str,
+    form: str,
+    without: Collection[str] = ("name",),
+    key: str = "name",
+    takes: Sequence[str] | None = None,
+) -> Any:
     """What a group of the configuration stands for.
 
     Args:
@@ -69,20 +76,30 @@ def build_named(cfg: DictConfig, group: str, form: str, without: Collection[str]
         form: what is expected of a user's own, for errors.
         without: settings of the node that are not the thing's own.
         key: the setting that bears its name; a node with one of our names and no `_target_` is ours.
+        takes: what a thing that can be called will be called with; None: that is checked elsewhere.
+
+    Returns:
+        What `_target_` makes, or `source` names; of a class that needs no arguments an object.
 
     Raises:
         SettingError: in one line under the setting's name, for a `_target_` or `source` that does not exist, cannot be
-            called, is not trusted or does not take these settings, and whatever it refuses itself.
+            called, or not so, is not trusted or does not take these settings, and whatever it refuses itself.
     """
     node = OmegaConf.select(cfg, group)
     require(isinstance(node, DictConfig), group, node, form)
     told = plain(node)
     told.setdefault("_target_", targets_of(group, key).get(str(told.get(key))))
     if told["_target_"] is None:
-        require(told.get("source") is not None, f"{group}.source", None, f"package.module:function, {form}")
-        return load_function(told["source"], f"{group}.source")
-    settings = {key: value for key, value in told.items() if key not in without}
-    return _build(settings, group, bool(OmegaConf.select(cfg, "trust")), form)
+        setting, source = f"{group}.source", told.get("source")
+        require(source is not None, setting, None, f"package.module:function, {form}")
+        made = made_if_class(load_function(source, setting))
+    else:
+        setting, source = group, told["_target_"]
+        settings = {key: value for key, value in told.items() if key not in without}
+        made = _build(settings, group, bool(OmegaConf.select(cfg, "trust")), form)
+    if takes is not None and callable(made):
+        require_takes(made, takes, setting, source)
+    return made
 
 
 def _build(node: dict[str, Any], where: str, trusted: bool, form: str) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import replace
 from typing import Any
 
@@ -43,15 +43,16 @@ def build_reward(cfg: DictConfig) -> Any:
     """The group `reward`: the name of a measure of nearness, or a function of points, as `Observer.reward` takes them.
 
     Raises:
-        SettingError: for an unknown name, or what is no function.
+        SettingError: for an unknown name, what is no function of points, or what cannot be hashed.
     """
     name = name_of(cfg, "reward")
     if name in ("inverse_range", "range"):
         return name
     if name == "of_class":
         return "inverse_range"
-    made: Callable[[Tensor], Tensor] = build_named(cfg, "reward", FORM)
+    made: Callable[[Tensor], Tensor] = build_named(cfg, "reward", FORM, takes=("points",))
     require(callable(made), "reward", type(made).__name__, FORM)
+    _require_hashable(made, "reward")
     return made
 
 
@@ -67,7 +68,14 @@ def build_classes(cfg: DictConfig) -> Classes | None:
     classes = construct(Classes, settings, "reward")
     if cfg.reward.get("evidence") is None:
         return classes
-    made = build_named(cfg, "reward.evidence", EVIDENCE, ())
+    made = build_named(cfg, "reward.evidence", EVIDENCE, (), takes=("views", "retina", "matches"))
+    _require_hashable(made, "reward.evidence")
     known = made.marks + 1 if isinstance(made, Stripes) else classes.count
     require(classes.count == known, "reward.count", classes.count, f"{known}, one more than reward.evidence's marks")
     return replace(classes, evidence=made)
+
+
+def _require_hashable(made: object, setting: str) -> None:
+    """What belongs to an observer is a key of what is kept for one."""
+    expected = "a function, or an object that can be hashed, such as a frozen dataclass's"
+    require(isinstance(made, Hashable), setting, type(made).__name__, expected)

@@ -9,14 +9,19 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-__all__ = ["print_figures", "progress_bar", "say", "wide_screen"]
+__all__ = ["in_words", "print_figures", "progress_bar", "say", "wide_screen"]
+
+
+def in_words(figure: Any) -> str:
+    """A figure in four digits; a dash for what nobody knows, whole numbers as they are."""
+    return "-" if figure is None else f"{figure:.4g}" if isinstance(figure, float) else str(figure)
 
 
 def print_figures(figures: Mapping[str, Any]) -> None:
-    """A row for each figure; a dash for what nobody knows, whole numbers as they are."""
+    """A row for each figure."""
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     for name, value in figures.items():
-        table.add_row(name, "-" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value))
+        table.add_row(name, in_words(value))
     Console().print(table)
 
 

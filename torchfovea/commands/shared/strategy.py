@@ -16,6 +16,7 @@ from torchfovea.commands.shared.settings import within
 from torchfovea.deciding import strategies
 from torchfovea.deciding.strategies import Strategy, View
 from torchfovea.deciding.weighted import Weighting
+from torchfovea.imported import require_takes
 from torchfovea.perception import Observer
 from torchfovea.search import StopRule
 from torchfovea.setting import require, typed
@@ -55,6 +56,7 @@ def build_strategy(cfg: DictConfig, observer: Observer, best: Tensor | None = No
     if needs:  # a maker, of what a configuration cannot say
         made = made(**{key: known[key] for key in needs})
         require(callable(made), "acquisition", f"{type(made).__name__} from {name}", FORM)
+    require_takes(made, ("view",), "acquisition", OmegaConf.select(cfg, "acquisition.source") or name)
     target = OmegaConf.select(cfg, "acquisition._target_")
     strategy: Strategy = made if isinstance(target, str) and target.startswith("torchfovea.") else _checked(made, name)
     return strategy
