@@ -11,7 +11,7 @@ from functools import lru_cache
 from numbers import Real
 from typing import Any
 
-__all__ = ["SettingError", "check_types", "require", "require_name", "typed"]
+__all__ = ["SettingError", "check_types", "is_number", "require", "require_name", "typed"]
 
 PLAIN = {"float": float, "int": int, "bool": bool, "str": str}
 ALIASES = {"Range": "tuple[float, float]", "Grid": "tuple[int, int]"}
@@ -74,6 +74,11 @@ def _fields(kind: type) -> list[tuple[str, str, Any]]:
     found = [(field, field.default_factory) for field in dataclasses.fields(kind)]
     own = [made if isinstance(made, type) and made.__name__ == str(field.type) else None for field, made in found]
     return [(field.name, str(field.type), made) for (field, _), made in zip(found, own, strict=True)]
+
+
+def is_number(value: Any) -> bool:
+    """Whether it is a finite number, and not a truth value."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def typed(value: Any, kind: str, setting: str) -> Any:

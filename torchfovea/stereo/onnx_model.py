@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.gaussian import columns
-from torchfovea.setting import SettingError, require
+from torchfovea.setting import SettingError, is_number, require
 from torchfovea.stereo.maps import read_values
 
 __all__ = ["OnnxModel"]
@@ -91,7 +91,7 @@ class OnnxModel:
         require(self.model is not None, "matcher.model", None, "an ONNX file: matcher.model=FILE")
         for name in ("mean", "std"):
             values = np.atleast_1d(np.asarray(getattr(self, name), dtype=object))
-            good = values.shape in ((1,), (3,)) and all(_is_number(v) for v in values)
+            good = values.shape in ((1,), (3,)) and all(is_number(v) for v in values)
             require(good, f"matcher.source.{name}", getattr(self, name), "a number, or three for red, green and blue")
         nonzero = all(v != 0 for v in np.atleast_1d(self.std))
         require(nonzero, "matcher.source.std", self.std, "numbers other than 0")
@@ -218,10 +218,6 @@ class OnnxModel:
             require(name is None or name in outputs, f"matcher.source.{setting}", name, form)
         read = (self.disparity or outputs[0], *([] if self.worth is None else [self.worth]))
         return Layout(tuple(names), channels or 3, stacked, (height, width), TYPES[chosen[0].type], read)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _line(error: Exception) -> str:

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from torchfovea.commands.shared.cameras import BY_HAND, OF_FILES, cameras_of
 from torchfovea.commands.shared.images import exposed, read_levels
-from torchfovea.commands.shared.settings import choice, is_number
+from torchfovea.commands.shared.settings import choice
 from torchfovea.commands.shared.truth import load_truth
 from torchfovea.sensing.camera import Camera, Pinhole
-from torchfovea.setting import SettingError, require
+from torchfovea.setting import SettingError, is_number, require
 from torchfovea.stereo.calibration_files import StereoCalibration, load_calibration
 from torchfovea.stereo.disparity_files import load_disparity
 from torchfovea.stereo.health import Fault

@@ -11,10 +11,10 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from torchfovea.commands.shared.named import build_named, name_of
-from torchfovea.commands.shared.settings import construct, is_number
+from torchfovea.commands.shared.settings import construct
 from torchfovea.deciding import reward
 from torchfovea.memory.classes import Classes
-from torchfovea.setting import require
+from torchfovea.setting import is_number, require
 from torchfovea.stereo.stripes import Stripes
 
 __all__ = ["build_classes", "build_reward", "nearest_to"]

@@ -14,10 +14,10 @@ from typing import Any, TypeVar
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from torchfovea.setting import require, typed
+from torchfovea.setting import is_number, require, typed
 
 __all__ = [
-    "changed", "choice", "construct", "device_of", "is_number", "is_whole", "number", "numbers", "plain", "whole",
+    "changed", "choice", "construct", "device_of", "is_whole", "number", "numbers", "plain", "whole",
     "wholes", "within", "words",
 ]  # fmt: skip
 
@@ -124,8 +124,3 @@ def wholes(cfg: DictConfig, setting: str, least: int) -> list[int]:
 def is_whole(value: Any) -> bool:
     """Whether it is a whole number, however it is written (1e9), and not a truth value."""
     return is_number(value) and float(value).is_integer()
-
-
-def is_number(value: Any) -> bool:
-    """Whether it is a finite number, and not a truth value."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
