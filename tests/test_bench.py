@@ -227,6 +227,12 @@ def test_the_command(tmp_path, capsys):
     assert out.strip().splitlines()[-1] == str(tmp_path / "run")
 
 
+def test_sweeps_are_timed_together_and_one_by_one(tmp_path, capsys):
+    assert run(tmp_path, "paths=[saccade]", "matcher=sweep") == 0, capsys.readouterr().err
+    rows = list(csv.DictReader((tmp_path / "run" / "bench.csv").read_text().splitlines()))
+    assert [row["peer"] for row in rows] == ["", "one by one"] and "2 pairs together" in rows[1]["work"]
+
+
 def test_some_paths_only(tmp_path, capsys):
     assert run(tmp_path, "paths=[align,decide]") == 0, capsys.readouterr().err
     result = json.loads((tmp_path / "run" / "result.json").read_text())

@@ -50,7 +50,7 @@ def aggregate(cost: Tensor, values: Tensor, closed: bool, small: float, large: f
         shades = cost.new_empty(length, len(ways), batch * other)
         for k, way in enumerate(ways):
             place = way % size if around else way.clamp(0, size - 1)
-            costs[:, :, k], shades[:, k] = line[place], image[place]
+            costs[:, :, k], shades[:, k] = line.index_select(0, place), image.index_select(0, place)
         bound = (large / (1 + (shades[1:] - shades[:-1]).abs() / contrast)).clamp_(min=small)
         _pass(costs.flatten(2), bound.flatten(1), small)
         out = total.permute(2, 0, 1, 3) if dim == 2 else total.permute(3, 0, 1, 2)

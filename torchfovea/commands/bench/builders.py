@@ -10,7 +10,7 @@ from functools import cache
 import torch
 from omegaconf import DictConfig
 
-from torchfovea.commands.bench.episodes import episode, photometric_saccade, picture, tuning_episode
+from torchfovea.commands.bench.episodes import episode, photometric_saccade, picture, sweeps, tuning_episode
 from torchfovea.commands.bench.look import Saccade, saccade
 from torchfovea.commands.bench.paths import paths_of_look
 from torchfovea.commands.bench.retina_paths import path_of_retina
@@ -78,6 +78,10 @@ def builders_of(cfg: DictConfig, device: str, wanted: Sequence[str]) -> list[Cal
             (("saccade",), lambda: [photometric_saccade(cfg, full)]),
             (("tune",), lambda: [tuning_episode(cfg, full)]),
         ]
+        if cfg.matcher.name == "sweep":  # others match pair by pair
+            builders.append(
+                (("saccade",), lambda: [sweeps(cfg, dataclasses.replace(full, retina=small.retina), batch)])
+            )
     return [build for names, build in builders if set(names) & set(wanted)]
 
 

@@ -22,11 +22,12 @@ from torchfovea.perception import Observer, Step, compiled, decide, new_memory, 
 from torchfovea.sensing.camera import image_camera
 from torchfovea.sensing.head import Gaze, eyes
 from torchfovea.sim import gl, rays
+from torchfovea.stereo.matchers import match_all
 from torchfovea.tuning.scenes import Distribution, draw_scenes
 from torchfovea.tuning.simulator import simulate
 from torchfovea.tuning.worlds import Task, Worlds, world_of
 
-__all__ = ["episode", "photometric_saccade", "picture", "tuning_episode"]
+__all__ = ["episode", "photometric_saccade", "picture", "sweeps", "tuning_episode"]
 
 
 def picture(cfg: DictConfig, observer: Observer, size: int) -> Path:
@@ -89,6 +90,34 @@ def photometric_saccade(cfg: DictConfig, observer: Observer) -> Path:
     quick = compiled_peer(cfg.compile, lambda mode: of(compiled(observer, mode)))
     work = f"two pictures of {int(cfg.sensor.source_px)} px by rays, {cfg.matcher.name}, to the next fixation"
     return Path("saccade", work, "cpu", ours, quick, check)
+
+
+def sweeps(cfg: DictConfig, observer: Observer, batch: int) -> Path:
+    """Sweeps of several pairs of pictures together, as environments ask for them, and one by one."""
+    settings = changed(cfg, {"fidelity": "photometric", "sensor": {"sample": None}})
+    zero, tasks = torch.zeros(()), []
+    gaze = Gaze(zero, zero + 0.3, zero + 0.1)
+    for seed in range(int(cfg.seed), int(cfg.seed) + batch):
+        arena = build_arena(settings, observer, seed)
+        left, right = arena.world.images(gaze)
+        tasks.append(arena.task(left.image, right.image, gaze))
+    views, matchers = [view for view, _ in tasks], [matcher for _, matcher in tasks]
+
+    def together(mode: str = "off") -> list[Any]:
+        with compiling(mode):
+            return match_all(matchers, views, observer.retina, observer.budget)
+
+    def alone() -> list[Any]:
+        return [matcher(view, observer.retina, observer.budget) for view, matcher in tasks]
+
+    def check() -> None:
+        for (ours, _), (theirs, _) in zip(together(), alone(), strict=True):
+            both = ours.valid & theirs.valid
+            same("saccade", ours.right_px[both], theirs.right_px[both], 1e-3, 0.99)
+
+    work = f"the sweep alone, {observer.retina.count} RFs; {batch} pairs together"
+    peers = Peer("one by one", alone), *compiled_peer(cfg.compile, lambda mode: partial(together, mode))
+    return Path("saccade", work, "cpu", together, peers, check, units=batch)
 
 
 def episode(cfg: DictConfig, observer: Observer, batch: int, device: str, compile: str = "off") -> Path:
