@@ -19,7 +19,8 @@ from torchfovea.stereo.views import Views, batched_views
 
 __all__ = ["Match", "Matcher", "Narrowed", "checked_matches", "match_all"]
 
-TOGETHER = 64_000  # receptive fields that are matched at once, 2 to 3 kB each: more gain nothing
+# receptive fields, and pixels, that are matched at once: 200 MB hold either, and more gain nothing
+FIELDS, PIXELS = 64_000, 2_000_000
 
 
 @runtime_checkable
@@ -110,7 +111,7 @@ def match_all(
         budget: of all.
     """
     found: list[tuple[Correspondences, Any]] = []
-    most = max(1, TOGETHER // retina.count)
+    most = max(1, min(FIELDS // retina.count, PIXELS // (2 * views[0].left[0].numel())))
     for start in range(0, len(views), most):
         own, pairs = matchers[start : start + most], views[start : start + most]
         together, batch = _as_one(own), batched_views(pairs)
