@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import ClassVar, Protocol, Self, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -17,10 +17,7 @@ from torch import Tensor
 from torchfovea.gaussian import columns
 from torchfovea.setting import check_types, require
 
-__all__ = ["Camera", "Fisheye", "Pinhole", "image_camera"]
-
-
-_Plain = TypeVar("_Plain", "Pinhole", "Fisheye")
+__all__ = ["Camera", "Fisheye", "Optics", "Pinhole", "image_camera"]
 
 
 @runtime_checkable
@@ -72,7 +69,28 @@ class Camera(Protocol):
 
 
 @dataclass(frozen=True)
-class Pinhole:
+class Optics:
+    """What the cameras here and the lenses have in common: sound numbers, and other pixels."""
+
+    _lengths: ClassVar[tuple[str, ...]] = ("focal_px",)
+
+    def __post_init__(self) -> None:
+        """Raise SettingError unless the focal lengths are positive and all is finite."""
+        check_types(self)
+        for name in self._lengths:
+            require(0 < getattr(self, name) < math.inf, name, getattr(self, name), "a positive number of pixels")
+        for name in ("cx_px", "cy_px"):
+            require(math.isfinite(getattr(self, name)), name, getattr(self, name), "a finite number of pixels")
+
+    def scaled(self, scale: float, shift_px: tuple[float, float]) -> Self:
+        """The same camera in other pixels: place p becomes scale · p + shift."""
+        shift = dict(zip(("cx_px", "cy_px"), shift_px, strict=True))
+        moved = {name: scale * getattr(self, name) + by for name, by in shift.items()}
+        return replace(self, **moved, **{name: scale * getattr(self, name) for name in self._lengths})
+
+
+@dataclass(frozen=True)
+class Pinhole(Optics):
     """The paper's camera: px = focal_px · (x, y)/z + centre.
 
     Attributes:
@@ -84,11 +102,6 @@ class Pinhole:
     focal_px: float
     cx_px: float = 0.0
     cy_px: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Raise SettingError unless the focal length is positive and all is finite."""
-        check_types(self)
-        _require_numbers(self)
 
     @staticmethod
     def from_fov(fov_deg: float, radius_px: float) -> Pinhole:
@@ -124,13 +137,9 @@ class Pinhole:
         x, y, z = direction.unbind(-1)  # a sum over strided axes takes several times as long
         return z > 1e-6 * (x.abs() + y.abs() + z.abs())
 
-    def scaled(self, scale: float, shift_px: tuple[float, float]) -> Pinhole:
-        """The same camera in other pixels: place p becomes scale · p + shift."""
-        return _scaled(self, scale, shift_px)
-
 
 @dataclass(frozen=True)
-class Fisheye:
+class Fisheye(Optics):
     """Equidistant fisheye: the distance from the centre is focal_px times the angle from the axis.
 
     Attributes:
@@ -142,11 +151,6 @@ class Fisheye:
     focal_px: float
     cx_px: float = 0.0
     cy_px: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Raise SettingError unless the focal length is positive and all is finite."""
-        check_types(self)
-        _require_numbers(self)
 
     @staticmethod
     def from_fov(fov_deg: float, radius_px: float) -> Fisheye:
@@ -183,21 +187,6 @@ class Fisheye:
         """Whether directions (..., 3) have a pixel (all but straight behind); bool (...)."""
         x, y, z = direction.unbind(-1)
         return (z > 0) | (x * x + y * y > 1e-12 * z * z)
-
-    def scaled(self, scale: float, shift_px: tuple[float, float]) -> Fisheye:
-        """The same camera in other pixels: place p becomes scale · p + shift."""
-        return _scaled(self, scale, shift_px)
-
-
-def _scaled(camera: _Plain, scale: float, shift_px: tuple[float, float]) -> _Plain:
-    cx, cy = (scale * c + by for c, by in zip((camera.cx_px, camera.cy_px), shift_px, strict=True))
-    return replace(camera, focal_px=scale * camera.focal_px, cx_px=cx, cy_px=cy)
-
-
-def _require_numbers(camera: Pinhole | Fisheye) -> None:
-    require(0 < camera.focal_px < math.inf, "focal_px", camera.focal_px, "a positive number of pixels")
-    for name in ("cx_px", "cy_px"):
-        require(math.isfinite(getattr(camera, name)), name, getattr(camera, name), "a finite number of pixels")
 
 
 def image_camera(camera: Camera, radius_px: float, size_px: int) -> Camera:

@@ -16,17 +16,17 @@ References:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
+from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchfovea.gaussian import columns
-from torchfovea.sensing.camera import Fisheye
-from torchfovea.setting import check_types, require
+from torchfovea.sensing.camera import Fisheye, Optics
+from torchfovea.setting import require
 
 __all__ = ["BrownConrady", "KannalaBrandt"]
 
@@ -34,7 +34,33 @@ STEPS = 8  # of Newton's method, quadratic: four do but near the fold
 
 
 @dataclass(frozen=True)
-class BrownConrady:
+class _Lens(Optics):
+    """A camera with two focal lengths and coefficients of distortion, so many as one of `_counts`."""
+
+    _lengths: ClassVar[tuple[str, ...]] = ("fx_px", "fy_px")
+    _counts: ClassVar[tuple[int, ...]] = ()
+    _names: ClassVar[str] = ""
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Raise SettingError for focal lengths that are not positive, and what is no set of coefficients."""
+        super().__post_init__()
+        require(all(map(math.isfinite, self.distortion)), "distortion", self.distortion, "finite numbers")
+        require(len(self.distortion) in self._counts, "distortion", self.distortion, self._names)
+
+    @property
+    def focal_px(self) -> float:
+        """The mean (geometric) of both focal lengths [px, of a fisheye px/rad]."""
+        return math.sqrt(self.fx_px * self.fy_px)
+
+
+@dataclass(frozen=True)
+class BrownConrady(_Lens):
     """A pinhole behind a lens, as OpenCV's `calibrateCamera` and ROS (plumb_bob, rational_polynomial) describe it.
 
     With (x, y) = (X, Y)/Z, r² = x² + y² and q = (1 + k₁r² + k₂r⁴ + k₃r⁶)/(1 + k₄r² + k₅r⁴ + k₆r⁶),
@@ -49,23 +75,8 @@ class BrownConrady:
         distortion: (k1, k2, p1, p2[, k3[, k4, k5, k6]]), or none.
     """
 
-    fx_px: float
-    fy_px: float
-    cx_px: float
-    cy_px: float
-    distortion: tuple[float, ...] = ()
-
-    def __post_init__(self) -> None:
-        """Raise SettingError for focal lengths that are not positive, and what is no set of coefficients."""
-        check_types(self)
-        _require_numbers(self)
-        fits = len(self.distortion) in (0, 4, 5, 8)
-        require(fits, "distortion", self.distortion, "k1, k2, p1, p2[, k3[, k4, k5, k6]], or none")
-
-    @property
-    def focal_px(self) -> float:
-        """The mean (geometric) of both focal lengths [px]."""
-        return math.sqrt(self.fx_px * self.fy_px)
+    _counts = (0, 4, 5, 8)
+    _names = "k1, k2, p1, p2[, k3[, k4, k5, k6]], or none"
 
     @property
     def straight(self) -> bool:
@@ -122,10 +133,6 @@ class BrownConrady:
         ahead = z > 1e-6 * (x.abs() + y.abs() + z.abs())
         return ahead if math.isinf(self.fold) else ahead & (x * x + y * y < (self.fold * z).square())
 
-    def scaled(self, scale: float, shift_px: tuple[float, float]) -> BrownConrady:
-        """The same camera in other pixels: place p becomes scale · p + shift."""
-        return _scaled(self, scale, shift_px)
-
     def _distorted(self, place: Tensor) -> Tensor:
         """Places (..., 2) on the plane z = 1 as the lens shows them there."""
         if self.straight:
@@ -167,7 +174,7 @@ class BrownConrady:
 
 
 @dataclass(frozen=True)
-class KannalaBrandt:
+class KannalaBrandt(_Lens):
     """A fisheye, as OpenCV's `fisheye` module, ROS (equidistant, fisheye) and Kalibr (equidistant) describe it.
 
     A direction at angle θ from the axis lands at d(θ) = θ (1 + k₁θ² + k₂θ⁴ + k₃θ⁶ + k₄θ⁸) from it, times fx or fy.
@@ -180,22 +187,10 @@ class KannalaBrandt:
         distortion: (k1, k2, k3, k4).
     """
 
-    fx_px: float
-    fy_px: float
-    cx_px: float
-    cy_px: float
+    _counts = (4,)
+    _names = "k1, k2, k3, k4"
+
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        """Raise SettingError for focal lengths that are not positive, and what is no set of coefficients."""
-        check_types(self)
-        _require_numbers(self)
-        require(len(self.distortion) == 4, "distortion", self.distortion, "k1, k2, k3, k4")
-
-    @property
-    def focal_px(self) -> float:
-        """The mean (geometric) of both focal lengths [px/rad]."""
-        return math.sqrt(self.fx_px * self.fy_px)
 
     @cached_property
     def fold_rad(self) -> float:
@@ -242,10 +237,6 @@ class KannalaBrandt:
         near = torch.atan2((x * x + y * y).sqrt(), z) < self.fold_rad
         return near & Fisheye(1.0).in_view(direction)
 
-    def scaled(self, scale: float, shift_px: tuple[float, float]) -> KannalaBrandt:
-        """The same camera in other pixels: place p becomes scale · p + shift."""
-        return _scaled(self, scale, shift_px)
-
     def _ratio(self, t: Tensor) -> Tensor:
         """The ratio q = d(θ)/θ for t = θ²."""
         k1, k2, k3, k4 = self.distortion
@@ -260,25 +251,8 @@ class KannalaBrandt:
         return held - (held * ratio * ratio - square) / slope.clamp(min=1e-3)
 
 
-_Lens = TypeVar("_Lens", BrownConrady, KannalaBrandt)
-
-
-def _scaled(lens: _Lens, scale: float, shift_px: tuple[float, float]) -> _Lens:
-    cx, cy = (scale * c + by for c, by in zip((lens.cx_px, lens.cy_px), shift_px, strict=True))
-    return replace(lens, fx_px=scale * lens.fx_px, fy_px=scale * lens.fy_px, cx_px=cx, cy_px=cy)
-
-
 def _first_root(polynomial: np.polynomial.Polynomial) -> float:
     """The least positive real root; infinite if there is none."""
     roots = polynomial.trim().roots()
     real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 1e-12)]
     return float(real.min()) if real.size else math.inf
-
-
-def _require_numbers(lens: BrownConrady | KannalaBrandt) -> None:
-    for name in ("fx_px", "fy_px"):
-        require(0 < getattr(lens, name) < math.inf, name, getattr(lens, name), "a positive number of pixels")
-    for name in ("cx_px", "cy_px"):
-        require(math.isfinite(getattr(lens, name)), name, getattr(lens, name), "a finite number of pixels")
-    finite = all(isinstance(k, int | float) and math.isfinite(k) for k in lens.distortion)
-    require(finite, "distortion", lens.distortion, "finite numbers")
