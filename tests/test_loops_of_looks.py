@@ -8,6 +8,7 @@ from test_loops import CLOSE, both, same
 from torchfovea import LogPolar, Observer
 from torchfovea.sensing.camera import image_camera
 from torchfovea.sensing.head import Gaze, Head, eyes
+from torchfovea.sensing.retina import interpolate
 from torchfovea.sim.arena import SimulatedArena
 from torchfovea.sim.cans import Cans
 from torchfovea.sim.model import EgoPose
@@ -57,6 +58,22 @@ def test_a_loop_paints_as_the_definition(repeat_m):
     error = (one - other).abs().amax(0)
     # beside a seam of what repeats, rounding may put a place on either side
     assert error.median() < 1e-4 and error.quantile(0.99) < 1e-3
+
+
+@pytest.mark.parametrize("dtype", CLOSE)
+@pytest.mark.parametrize("retina", [LogPolar(900), LogPolar(4000, rho_min_px=20.0, uniform_fovea=True)])
+def test_a_loop_reads_between_rings_as_the_definition(retina, dtype):
+    """Everywhere on the retina and beyond, in all directions, along the axes, across the seam and at the centre."""
+    generator = torch.Generator().manual_seed(0)
+    px = 240 * torch.rand(3000, 2, generator=generator, dtype=torch.float64) - 120
+    px[1000:2000] *= 0.03
+    axes = torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 1e-7], [1.0, -1e-7], [-1.0, -1e-7]])
+    px[2000:2700] = (axes[:, None] * torch.linspace(0, 150, 100)[:, None]).flatten(0, 1)
+    values = torch.rand(2, 3, retina.count, generator=generator, dtype=torch.float64)
+    one, other = both(lambda: interpolate(values.to(dtype), retina, px.to(dtype)))
+    assert one.shape == (2, 3, 3000)
+    # a place is known to a digit of its ring
+    torch.testing.assert_close(one, other, rtol=0, atol=1e-9 if dtype == torch.float64 else 2e-5)
 
 
 @pytest.mark.parametrize("dtype", CLOSE)

@@ -23,7 +23,7 @@ from torch import Tensor
 from torchfovea.finite import require_finite
 from torchfovea.gaussian import columns
 from torchfovea.sensing.layout import LogPolar, Retina, Uniform, cortical
-from torchfovea.sensing.sampling import constant, halved, place, read, sampling, wide
+from torchfovea.sensing.sampling import Rings, constant, halved, place, read, read_rings, ring_numbers, sampling, wide
 from torchfovea.sensing.triangles import from_triangles
 from torchfovea.setting import require
 
@@ -226,28 +226,16 @@ def _pyramid(image: Tensor, levels: int) -> Tensor:
     return torch.cat([F.pad(level, (0, width - level.shape[-1])) for level in pyramid], -2)
 
 
-class _Rings(NamedTuple):
-    """A log-polar retina's numbers."""
-
-    shape: tuple[int, int]
-    fovea_count: int
-    innermost_px: float
-    growth: float
-
-
-@constant
-def ring_numbers(retina: LogPolar) -> _Rings:
-    innermost = retina.rho_min_px * math.sqrt(retina.base)
-    return _Rings(retina.shape, retina.fovea_count, innermost, math.log(retina.base))
-
-
 @constant
 def count_of(retina: Retina) -> int:
     return retina.count
 
 
-def _from_rings(values: Tensor, rings: _Rings, px: Tensor) -> Tensor:
+def _from_rings(values: Tensor, rings: Rings, px: Tensor) -> Tensor:
     """(B, C, N) at px (P, 2)."""
+    fast = read_rings(values, rings, px)
+    if fast is not None:
+        return fast
     sectors, innermost = rings.shape[1], rings.innermost_px
     image = values[..., rings.fovea_count :].unflatten(-1, rings.shape)
     image = torch.cat([image[..., :1, :].mean(-1, keepdim=True).expand(*image.shape[:2], 1, sectors), image], -2)

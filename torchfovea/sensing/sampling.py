@@ -11,10 +11,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfovea.machine import Loops, loops
-from torchfovea.sensing.layout import Retina
+from torchfovea.machine import Loops, columns_of, loops
+from torchfovea.sensing.layout import LogPolar, Retina
 
-__all__ = ["Sampling", "constant", "halved", "place", "read", "sampling", "wide"]
+__all__ = [
+    "Rings",
+    "Sampling",
+    "constant",
+    "halved",
+    "place",
+    "read",
+    "read_rings",
+    "ring_numbers",
+    "sampling",
+    "wide",
+]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -99,9 +110,46 @@ def halved(image: Tensor, levels: int) -> Tensor | None:
     return pyramid
 
 
+def read_rings(values: Tensor, rings: Rings, px: Tensor) -> Tensor | None:
+    """(B, C, P) of a log-polar retina's values (B, C, N) at places (P, 2) [retinal px], by the loop of sampling.c.
+
+    None where there is no such loop, see `torchfovea.machine.loops`.
+    """
+    library = loops(values, px)
+    if library is None:
+        return None
+    seen = values.new_empty(*values.shape[:2], len(px))
+    sizes = (values.shape[:2].numel(), values.shape[-1], rings.fovea_count, *rings.shape, len(px))
+    library("read_rings", (*sizes, values.contiguous(), columns_of(px), rings.innermost_px, rings.growth), seen)
+    return seen
+
+
 def _planes(image: Tensor) -> tuple[int | Tensor, ...]:
     """Images (B, C, H, W) as sampling.c wants them, whose rows may be parts of longer ones."""
     return (image.shape[:2].numel(), *image.shape[2:], *image.stride()[1:3], image)
+
+
+class Rings(NamedTuple):
+    """A log-polar retina's numbers.
+
+    Attributes:
+        shape: rings and sectors.
+        fovea_count: fields before those of the first ring.
+        innermost_px: radius of the first ring.
+        growth: by which the logarithm of the next one's is larger.
+    """
+
+    shape: tuple[int, int]
+    fovea_count: int
+    innermost_px: float
+    growth: float
+
+
+@constant
+def ring_numbers(retina: LogPolar) -> Rings:
+    """What places on a log-polar retina are counted by."""
+    innermost = retina.rho_min_px * math.sqrt(retina.base)
+    return Rings(retina.shape, retina.fovea_count, innermost, math.log(retina.base))
 
 
 @constant
