@@ -9,6 +9,8 @@ from pathlib import Path
 
 from torchfovea.cli import main
 
+if len(sys.argv) != 2:
+    sys.exit("python examples/sweep.py FOLDER: expected a folder for the runs")
 folder = Path(sys.argv[1])
 sizes = ["fidelity=geometric", "episodes=4", "saccades=6", "memory.cells=400", "sensor.receptive_fields=1000"]
 swept = ["acquisition.alpha=0,2", "sensor=log_polar,uniform", "scene=cans", "picture=false"]

@@ -104,8 +104,13 @@ def test_what_was_read_is_kept(recording, tmp_path, capsys, skip):
         (lambda path: None, ["bag.left=/x"], "bag.left = /x: expected no such setting"),
         (lambda path: None, ["sensor.fov_deg=90"], "sensor.fov_deg = 90: expected no such setting"),
         (lambda path: None, ["skip=3"], "skip = 3: expected true or false"),
+        (
+            lambda path: None,
+            ["acquisition=oracle"],
+            "acquisition = oracle: expected one that does not ask where the target is",
+        ),
     ],
-    ids=["first", "table", "nothing", "bag", "fov", "skip"],
+    ids=["first", "table", "nothing", "bag", "fov", "skip", "an oracle"],
 )
 def test_a_mistake_is_one_line_and_leaves_nothing(recording, tmp_path, capsys, spoil, more, line):
     spoil(recording)

@@ -231,7 +231,9 @@ def _write_advantage(folder: Path, distance: Tensor, vergence: Tensor, advantage
         rows += [(name, float(d), float(v), *row) for d, v, row in zip(distance, vergence, values, strict=True)]
     write_csv(folder / "advantage.csv", ADVANTAGE_COLUMNS, rows)
     curves = {
-        name: tuple([math.nan if row[k] is None else row[k] for row in values] for k in (0, 1))
+        "as printed" if name == "printed" else f"image of {name.removeprefix('source_')} px": tuple(
+            [math.nan if row[k] is None else row[k] for row in values] for k in (0, 1)
+        )
         for name, values in advantage.items()
     }
     draw_advantage(folder / "advantage.png", distance, curves)  # type: ignore[arg-type]

@@ -210,5 +210,6 @@ def draw_realised(
         axes.set_xticks(place, labels)
         axes.grid(alpha=0.3, which="both")
     figure.axes[0].set_ylabel("median |range error| [mm]")
-    figure.axes[-1].legend(fontsize=9)
+    handles, names = figure.axes[-1].get_legend_handles_labels()
+    figure.legend(handles, names, fontsize=9, loc="outside lower center", ncols=2 if len(sizes) == 1 else len(names))
     write_figure(path, figure, dpi=90)

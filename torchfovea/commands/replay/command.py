@@ -73,6 +73,7 @@ def run(cfg: DictConfig) -> float | None:
     cfg = told_by(cfg, recording.calibration)
     observer = observer_of(build_observer(cfg), recording.calibration)
     rehearse(cfg, observer.head, observer)
+    require(cfg.acquisition.name != "oracle", "acquisition", "oracle", "one that does not ask where the target is")
     matcher, strategy, saved = build_match(cfg), build_strategy(cfg, observer), memory_path(cfg, "memory.save")
     ours = isinstance(matcher, Matcher) and not isinstance(matcher.params, External)
     ahead, folder = whole(cfg, "ahead", 0) * ours, run_folder()

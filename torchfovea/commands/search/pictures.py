@@ -51,7 +51,7 @@ def _scan_path(axes: Axes, episode: Episode) -> None:
     )
     for k in range(min(len(azimuth), 6)):
         axes.annotate(
-            str(k),
+            str(k + 1),  # as the curves count them
             (azimuth[k], elevation[k]),
             textcoords="offset points",
             xytext=(5, 4),

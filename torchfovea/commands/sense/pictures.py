@@ -17,6 +17,7 @@ from torchfovea.sensing.triangulation import Observations
 from torchfovea.stereo.sweep import SweepRange
 
 matplotlib.use("Agg")
+from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 
 __all__ = ["draw_sense"]
@@ -33,7 +34,7 @@ def draw_sense(path: Path, left: Tensor, found: Any, retina: Retina | None, obse
         found: a `Disparity`, a `SweepRange`, or what is not drawn.
         retina: of a `SweepRange`.
         observed: in inverse range.
-        px: the receptive fields, (N, 2), for the two maps.
+        px: the receptive fields, (N, 2), for the two maps, where each is drawn as wide as it is.
     """
     figure = Figure(figsize=(14, 8), layout="constrained")
     axes = figure.subplots(2, 2)
@@ -51,17 +52,22 @@ def draw_sense(path: Path, left: Tensor, found: Any, retina: Retina | None, obse
         figure.colorbar(drawn, ax=axes[0, 1], extend="both", label=name)
     keep = observed.valid & (observed.mean[:, 2] > 0)
     rho, sigma = observed.mean[keep, 2], observed.cov[keep, 5].sqrt()
+    seen = px[keep] if bool(keep.any()) else px
+    (left_px, top_px), (right_px, bottom_px) = (edge.tolist() for edge in (seen.amin(0) - 2, seen.amax(0) + 2))
+    wide, kind = (1.0, "") if retina is None else (np.asarray(retina.width_px(px[keep])), "retinal ")
     maps = (
         (1 / rho, "range", "range [m]", "viridis_r", False),
         (sigma / rho, "how surely it is known", "relative standard deviation of inverse range", "magma", True),
     )
     for place, (value, name, label, cmap, log) in zip(axes[1], maps, strict=True):
         low, high = inner_limits(value, 0.0) if len(value) else (0.1, 1.0)
-        drawn = place.scatter(
-            *px[keep].T, c=value, s=1.5, cmap=cmap, linewidths=0, norm="log" if log else None, rasterized=True
-        )
+        drawn = EllipseCollection(
+            wide, wide, 0.0, units="xy", offsets=np.asarray(px[keep]), offset_transform=place.transData,
+            array=np.asarray(value), cmap=cmap, norm="log" if log else None, rasterized=True,
+        )  # fmt: skip
         drawn.set_clim(low, max(high, low * 1.001 + 1e-9))
-        place.set(title=name, aspect="equal", facecolor="0.9", xlabel="column [px]", ylabel="row [px]")
-        place.invert_yaxis()
+        place.add_collection(drawn)
+        place.set(title=name, aspect="equal", facecolor="0.7", xlabel=f"{kind}column [px]", ylabel=f"{kind}row [px]")
+        place.set(xlim=(left_px, right_px), ylim=(bottom_px, top_px))
         figure.colorbar(drawn, ax=place, label=label)
     write_figure(path, figure, dpi=100)

@@ -224,7 +224,8 @@ def check_readable(cfg: DictConfig, observer: Observer) -> None:
     """
     seen = choice(cfg, "fidelity", ("photometric", "geometric")) == "photometric" and build_route(cfg) is None
     reads = observer.classes is None or (seen and observer.classes.evidence is not None)
-    expected = "motion=still and fidelity=geometric motor=instant in search, or pictures and reward.evidence"
+    geometric = "motion=still and fidelity=geometric motor=instant in search"
+    expected = f"{geometric}, or pictures and reward.evidence, as family=marked_images has"
     require(reads, "reward", "of_class", expected)
 
 

@@ -96,7 +96,7 @@ def _draw_learning(path: Path, state: State) -> None:
         ms=4,
         label="validation",
     )
-    ax.axhline(state.best_value, color="tab:blue", lw=0.7, ls=":")
+    ax.axhline(state.best_value, color="tab:blue", lw=0.7, ls=":", label="best, kept")
     ax.set(xlabel="simulated episodes", ylabel="objective")
     ax.legend(frameon=False)
     write_figure(path, figure, dpi=130)
