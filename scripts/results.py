@@ -15,6 +15,7 @@ import json
 import os
 import platform
 import re
+import shlex
 import statistics
 import subprocess
 import sys
@@ -103,8 +104,8 @@ def _kept(folder: Path, commit: str) -> Run:
                 rows = list(csv.DictReader(file))
             names = COLUMNS.get(path.stem)
             tables[path.stem] = [{name: row[name] for name in names or row if name in row} for row in rows]
-    said = " ".join(["torchfovea", command, *(word for word in words if not word.startswith(("picture=", "workers=")))])
-    return Run(said, commit, _machine(), result, tables)
+    words = [word for word in words if not word.startswith(("picture=", "workers="))]
+    return Run(shlex.join(["torchfovea", command, *words]), commit, _machine(), result, tables)
 
 
 def _commit() -> str:
@@ -137,7 +138,7 @@ def markdown(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 def settings(run: Run) -> dict[str, str]:
     """The settings of a run's command."""
-    return dict(word.split("=", 1) for word in run.command.split() if "=" in word)
+    return dict(word.split("=", 1) for word in shlex.split(run.command) if "=" in word)
 
 
 def percent(value: Any, digits: int = 1) -> str:
@@ -248,6 +249,20 @@ def claims(runs: Sequence[Run]) -> str:
     return markdown(("Sec.", "the paper's claim", "verdict", "estimate (95%)", "scenes"), rows)
 
 
+def ablation(runs: Sequence[Run]) -> str:
+    """What each change of a search does to its gap, the greatest loss first."""
+    rows = []
+    given = (row for run in runs for row in run.tables["ablation"])
+    for row in sorted(given, key=lambda row: float(row["gap_per_saccade"])):
+        change = "–"
+        if row["gap_change"]:
+            ends = (float(row[f"gap_change{end}"]) for end in ("", "_low", "_high"))
+            change = "{:+.3f} ({:+.3f} to {:+.3f})".format(*ends)
+        gap, saccades = f"{float(row['gap_per_saccade']):.3f}", f"{float(row['saccades_to_target']):.1f}"
+        rows.append([row["variant"], gap, change, percent(row["found"], 0), saccades])
+    return markdown(("change", "gap per saccade", "its change (95%)", "found", "saccades"), rows)
+
+
 def short(name: str, cell: str) -> str:
     """A cell as it is shown: a share in per cent, another number to three digits, words without underlines."""
     try:
@@ -271,6 +286,7 @@ TABLES: dict[str, Callable[[Sequence[Run]], str]] = {
     "honesty": honesty,
     "fusion": rows_of("fusion", FUSION, short),
     "claims": claims,
+    "ablation": ablation,
 }
 
 

@@ -30,6 +30,10 @@ HONESTY = """sensor,cells,looks,nees_mean,coverage_50,coverage_95,coverage_95_lo
 outlier_share,median_error,mean_error
 sgbm,20000,5,0.8512,0.711,0.9284,0.9221,0.9333,0.0222,0.0101,0.0502
 """
+ABLATION = """variant,gap_per_saccade,saccades_to_target,found,gap_change,gap_change_low,gap_change_high
+as it is,0.9769,1.1,1.0,,,
+printed,0.6549,41.7,0.2,-0.3220,-0.4851,-0.2143
+"""
 CLAIM = {
     "section": "7.2", "text": "A fovea helps", "verdict": "holds", "estimate": 8.4, "ci_low": 6.2, "ci_high": 10.1,
     "n": 20,
@@ -80,6 +84,14 @@ def run_of(folder, command, words, result, **tables):
             ["| sgbm | 20,000 | 5 | 0.85 | 0.71 | 0.928 (0.922–0.933) | 2.2% | 1.0% | 5.0% |"],
         ),
         (
+            "ablation",
+            ("reproduce", ["ablation=true", 'overrides=["a=b"]'], [CLAIM], {"ablation": ABLATION}),
+            [
+                "| printed | 0.655 | -0.322 (-0.485 to -0.214) | 20% | 41.7 |",
+                "| as it is | 0.977 | – | 100% | 1.1 |",
+            ],
+        ),
+        (
             "claims",
             ("reproduce", ["profile=reduced"], [CLAIM, {**CLAIM, "verdict": "undecided", "estimate": None}], {}),
             [
@@ -100,6 +112,7 @@ def test_a_table_is_what_its_runs_left(name, run, lines, tmp_path):
         assert line in table, new
     assert table[0] == "Before." and table[-1] == "After." and "yesterday" not in new
     said = " ".join(["torchfovea", command, *(word for word in words if word != "picture=false")])
+    said = said.replace('overrides=["a=b"]', """'overrides=["a=b"]'""")  # a shell would take the quotes away
     (origin,) = (line for line in table if line.startswith("*`"))
     assert origin.startswith(f"*`{said}`: at abc1234 on ") and "PyTorch" in origin
     assert results.renewed(new, tmp_path) == new  # once is enough
