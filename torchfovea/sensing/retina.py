@@ -17,13 +17,22 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from torchfovea.finite import require_finite
 from torchfovea.gaussian import columns
 from torchfovea.sensing.layout import LogPolar, Retina, Uniform, cortical
-from torchfovea.sensing.sampling import Rings, constant, halved, place, read, read_rings, ring_numbers, sampling, wide
+from torchfovea.sensing.sampling import (
+    Rings,
+    constant,
+    place,
+    read,
+    read_fields,
+    read_rings,
+    ring_numbers,
+    sampling,
+    wide,
+)
 from torchfovea.sensing.triangles import from_triangles
 from torchfovea.setting import require
 
@@ -68,13 +77,7 @@ def fovea(image: Tensor, gaze_px: Tensor | None, retina: Retina, scale: float | 
         require(fits, "gaze_px.shape", tuple(gaze_px.shape), form)
         rows = gaze_px if gaze_px.dim() == 3 else gaze_px[None] if len(image) == 1 else gaze_px[:, None]
         maps = place(plan, rows.to(image))
-    values = read(image, maps[..., : plan.above])
-    if plan.levels > 0:
-        higher = read(_pyramid(image, plan.levels), maps[..., plan.above :])
-        fine, coarse = higher.split([plan.fields - plan.above, plan.fields - plan.first], -1)
-        blended = torch.lerp(torch.cat([values[..., plan.first :], fine], -1), coarse, plan.blend)
-        values = torch.cat([values[..., : plan.first], blended], -1)
-    values = values.to(given)  # (B, C, G, N)
+    values = read_fields(image, maps, plan).to(given)  # (B, C, G, N)
     if gaze_px is not None and gaze_px.dim() == 3:
         return values.transpose(1, 2)
     return values[0].transpose(0, 1) if len(image) == 1 else values[:, :, 0]
@@ -192,38 +195,6 @@ def _check_gaze(gaze_px: Tensor) -> None:
     fits = gaze_px.dim() in (2, 3) and gaze_px.shape[-1] == 2
     require(fits, "gaze_px.shape", tuple(gaze_px.shape), "(B, 2) or (B, G, 2)")
     require_finite(gaze_px, "gaze_px", "finite pixels")
-
-
-def halve(image: Tensor) -> Tensor:
-    """The next level of the pyramid, ⌈H/2⌉ × ⌈W/2⌉; replicated beyond the border."""
-    return _halve_along(_halve_along(image, -2), -1) / 64
-
-
-def _halve_along(image: Tensor, dim: int) -> Tensor:
-    """Weights (1, 3, 3, 1) at every second pixel; slices are faster here than a convolution."""
-    if image.shape[dim] % 2:
-        image = torch.cat([image, image.narrow(dim, -1, 1)], dim)
-    pairs: Tensor = image.unflatten(dim, (-1, 2))
-    even, odd = pairs.unbind(dim)
-    count = even.shape[dim]
-    out = (even + odd).mul_(3)
-    out.narrow(dim, 1, count - 1).add_(odd.narrow(dim, 0, count - 1))
-    out.narrow(dim, 0, count - 1).add_(even.narrow(dim, 1, count - 1))
-    out.narrow(dim, 0, 1).add_(even.narrow(dim, 0, 1))
-    out.narrow(dim, -1, 1).add_(odd.narrow(dim, -1, 1))
-    return out
-
-
-def _pyramid(image: Tensor, levels: int) -> Tensor:
-    """Levels 1…`levels` of the pyramid, one below the other."""
-    fast = halved(image, levels)
-    if fast is not None:
-        return fast
-    pyramid = [halve(image)]
-    for _ in range(levels - 1):
-        pyramid.append(halve(pyramid[-1]))
-    width = pyramid[0].shape[-1]
-    return torch.cat([F.pad(level, (0, width - level.shape[-1])) for level in pyramid], -2)
 
 
 @constant

@@ -1,44 +1,23 @@
-/* What a retina reads: the halving of `torchfovea.sensing.retina.halve` and the bilinear reading of
+/* What a retina reads: the halving of `torchfovea.sensing.sampling.halve` and the bilinear reading of
 `torchfovea.sensing.sampling.read`; and what is read between the rings of one, `torchfovea.sensing.retina._from_rings`.
-These are the definition, in C. REAL is float or double. */
+These are the definition, in C. REAL is float or double.
+
+Up to four channels lie side by side, so that one load brings them all. */
 
 #include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
 #include <tgmath.h>
 
-#define BLOCK 256 /* places at once: what is worked out for them serves every channel */
+#define BLOCK 256 /* places at once */
+
+typedef REAL Four __attribute__((vector_size(4 * sizeof(REAL)), aligned(sizeof(REAL))));
 
 typedef struct {
-    int64_t planes, height, width;
-    int64_t plane, row; /* from one to the next, in numbers */
-    const REAL *image;
-} Planes;
-
-static REAL smaller(REAL a, REAL b) { return a < b ? a : b; }
-
-static int64_t kept(int64_t k, int64_t size) { return k < 0 ? 0 : k < size ? k : size - 1; }
-
-/* Weights (1, 3, 3, 1) / 8 along both axes at every second pixel, the border's value beyond it. The rows of the result
-are `stride` numbers apart, its planes `plane`; what is right of it is 0. -1 where memory runs out, else 0. */
-int64_t halve(const Planes *from, REAL *to, int64_t plane, int64_t stride) {
-    const int64_t height = from->height, width = from->width, rows = (height + 1) / 2, columns = (width + 1) / 2;
-    const int64_t line = from->row;
-    REAL *row = malloc((width + 4) * sizeof *row);
-    if (!row) return -1;
-    for (int64_t k = 0; k < from->planes * rows; k++) {
-        const int64_t j = k % rows;
-        const REAL *image = from->image + k / rows * from->plane;
-        const REAL *restrict a = image + kept(2 * j - 1, height) * line, *restrict b = image + 2 * j * line;
-        const REAL *restrict c = image + kept(2 * j + 1, height) * line, *restrict d = image + kept(2 * j + 2, height) * line;
-        REAL *restrict sum = row + 1, *restrict out = to + k / rows * plane + j * stride;
-        for (int64_t i = 0; i < width; i++) sum[i] = a[i] + d[i] + 3 * (b[i] + c[i]);
-        sum[-1] = sum[0], sum[width] = sum[width + 1] = sum[width - 1];
-        for (int64_t i = 0; i < columns; i++) out[i] = (sum[2 * i - 1] + sum[2 * i + 2] + 3 * (sum[2 * i] + sum[2 * i + 1])) / 64;
-        for (int64_t i = columns; i < stride; i++) out[i] = 0;
-    }
-    return free(row), 0;
-}
+    int64_t images, channels, height, width;
+    int64_t image, plane, row; /* from one to the next, in numbers; columns follow one another */
+    const REAL *values;
+} Images;
 
 typedef struct { /* coordinates from -1 to 1 between the border pixels */
     const REAL *x;
@@ -47,40 +26,99 @@ typedef struct { /* coordinates from -1 to 1 between the border pixels */
     int64_t image, gaze, place; /* from one to the next, in numbers */
 } Places;
 
-/* Values (images, channels, gazes, count) of images at places, the border's beyond it. */
-int64_t read_bilinear(const Planes *from, int64_t channels, const Places *at, REAL *restrict to) {
-    const int64_t width = from->width, height = from->height, line = from->row;
+typedef struct { /* torchfovea.sensing.sampling.Sampling; levels 0: all fields read the image, once */
+    int64_t fields, levels, first, above;
+    const REAL *blend;
+} Plan;
+
+static REAL smaller(REAL a, REAL b) { return a < b ? a : b; }
+
+static int64_t kept(int64_t k, int64_t size) { return k < 0 ? 0 : k < size ? k : size - 1; }
+
+static void pack(const Images *from, int64_t image, int64_t channel, int64_t channels, Four *restrict to) {
+    const REAL *values = from->values + image * from->image + channel * from->plane;
+    for (int64_t j = 0; j < from->height; j++) {
+        const REAL *restrict a = values + j * from->row, *restrict b = a + (channels > 1) * from->plane;
+        const REAL *restrict c = b + (channels > 2) * from->plane, *restrict d = c + (channels > 3) * from->plane;
+        for (int64_t i = 0; i < from->width; i++) to[j * from->width + i] = (Four){a[i], b[i], c[i], d[i]};
+    }
+}
+
+/* Weights (1, 3, 3, 1) / 8 along both axes at every second pixel, the border's value beyond it. Rows are `stride` and
+`line` pixels apart; what is right of the result is 0. `sum` has room for a row and three more. */
+static void halve(const Four *from, int64_t height, int64_t width, int64_t stride, Four *restrict to, int64_t line, Four *restrict sum) {
+    const int64_t columns = (width + 1) / 2;
+    for (int64_t j = 0; j < (height + 1) / 2; j++) {
+        const Four *restrict a = from + kept(2 * j - 1, height) * stride, *restrict b = from + 2 * j * stride;
+        const Four *restrict c = from + kept(2 * j + 1, height) * stride, *restrict d = from + kept(2 * j + 2, height) * stride;
+        Four *restrict out = to + j * line;
+        for (int64_t i = 0; i < width; i++) sum[i + 1] = a[i] + d[i] + 3 * (b[i] + c[i]);
+        sum[0] = sum[1], sum[width + 1] = sum[width + 2] = sum[width];
+        for (int64_t i = 0; i < columns; i++) out[i] = (sum[2 * i] + sum[2 * i + 3] + 3 * (sum[2 * i + 1] + sum[2 * i + 2])) * (REAL)(1.0 / 64);
+        for (int64_t i = columns; i < line; i++) out[i] = (Four){0};
+    }
+}
+
+/* Read some places of an image and go from what is in `to`, channels `plane` numbers apart, to that: all the way, or as
+far as `blend` says. */
+static void read(const Four *image, int64_t height, int64_t width, const Places *at, int64_t set, int64_t gaze, int64_t begin, int64_t end, const REAL *blend, int64_t channels, REAL *to, int64_t plane) {
     const REAL across = (REAL)0.5 * (width - 1), down = (REAL)0.5 * (height - 1), right = width - 1, low = height - 1;
+    const int64_t step = at->place, place = set * at->image + gaze * at->gaze;
+    const REAL *restrict xs = at->x + place, *restrict ys = at->y + place;
     int32_t first[BLOCK], beside[BLOCK], below[BLOCK];
-    const int32_t row = (int32_t)line;
-    REAL s[BLOCK], t[BLOCK];
-    for (int64_t k = 0; k < at->images * at->gazes; k++) {
-        const int64_t image = k / at->gazes, gaze = k % at->gazes, step = at->place;
-        const REAL *restrict xs = at->x + image * at->image + gaze * at->gaze;
-        const REAL *restrict ys = at->y + image * at->image + gaze * at->gaze;
-        for (int64_t start = 0; start < at->count; start += BLOCK) {
-            const int64_t count = at->count - start < BLOCK ? at->count - start : BLOCK;
-            for (int64_t p = 0; p < count; p++) {
-                const REAL far_x = (xs[(start + p) * step] + 1) * across, far_y = (ys[(start + p) * step] + 1) * down;
-                /* what is no number reads the corner */
-                const REAL x = smaller(far_x > 0 ? far_x : 0, right), y = smaller(far_y > 0 ? far_y : 0, low);
-                const int32_t i = (int32_t)x, j = (int32_t)y;
-                first[p] = j * row + i, s[p] = x - i, t[p] = y - j;
-                beside[p] = x < right, below[p] = y < low ? row : 0;
-            }
-            for (int64_t channel = 0; channel < channels; channel++) {
-                const REAL *restrict plane = from->image + (image * channels + channel) * from->plane;
-                REAL *restrict out = to + ((image * channels + channel) * at->gazes + gaze) * at->count + start;
-                for (int64_t p = 0; p < count; p++) {
-                    const REAL a = plane[first[p]], b = plane[first[p] + beside[p]];
-                    const REAL c = plane[first[p] + below[p]], d = plane[first[p] + below[p] + beside[p]];
-                    const REAL upper = a + s[p] * (b - a), lower = c + s[p] * (d - c);
-                    out[p] = upper + t[p] * (lower - upper);
-                }
-            }
+    REAL s[BLOCK], t[BLOCK], seen[4][BLOCK];
+    for (int64_t start = begin; start < end; start += BLOCK) {
+        const int64_t count = end - start < BLOCK ? end - start : BLOCK;
+        for (int64_t p = 0; p < count; p++) {
+            const REAL far_x = (xs[(start + p) * step] + 1) * across, far_y = (ys[(start + p) * step] + 1) * down;
+            /* what is no number reads the corner */
+            const REAL x = smaller(far_x > 0 ? far_x : 0, right), y = smaller(far_y > 0 ? far_y : 0, low);
+            const int32_t i = (int32_t)x, j = (int32_t)y;
+            first[p] = j * (int32_t)width + i, s[p] = x - i, t[p] = y - j;
+            beside[p] = x < right, below[p] = y < low ? (int32_t)width : 0;
+        }
+        for (int64_t p = 0; p < count; p++) {
+            const Four *above = image + first[p], *under = above + below[p];
+            const Four upper = above[0] + s[p] * (above[beside[p]] - above[0]), lower = under[0] + s[p] * (under[beside[p]] - under[0]);
+            const Four value = upper + t[p] * (lower - upper);
+            for (int c = 0; c < 4; c++) seen[c][p] = value[c];
+        }
+        for (int64_t c = 0; c < channels; c++) {
+            REAL *restrict out = to + c * plane + start - begin;
+            const REAL *restrict share = blend ? blend + start - begin : NULL;
+            for (int64_t p = 0; p < count; p++) out[p] = share ? out[p] + share[p] * (seen[c][p] - out[p]) : seen[c][p];
         }
     }
-    return 0;
+}
+
+/* Values (images, channels, gazes, fields). -1 where memory runs out, else 0. */
+int64_t look(const Images *from, const Places *at, const Plan *plan, REAL *to) {
+    const int64_t height = from->height, width = from->width, line = (width + 1) / 2, plane = at->gazes * plan->fields;
+    int64_t rows = 0;
+    for (int64_t level = 0, high = height; level < plan->levels; level++) rows += high = (high + 1) / 2;
+    Four *image = malloc((height * width + 1) * sizeof *image), *pyramid = malloc((rows * line + 1) * sizeof *pyramid);
+    Four *sum = malloc((width + 3) * sizeof *sum);
+    const int room = image && pyramid && sum;
+    for (int64_t k = 0; k < from->images * from->channels && room;) {
+        const int64_t set = k / from->channels, channel = k % from->channels, left = from->channels - channel;
+        const int64_t channels = left < 4 ? left : 4;
+        pack(from, set, channel, channels, image);
+        const Four *last = image;
+        Four *next = pyramid;
+        for (int64_t level = 0, high = height, wide = width, stride = width; level < plan->levels; level++) {
+            halve(last, high, wide, stride, next, line, sum);
+            last = next, high = (high + 1) / 2, wide = (wide + 1) / 2, stride = line, next += high * line;
+        }
+        for (int64_t gaze = 0; gaze < at->gazes; gaze++) {
+            REAL *out = to + k * plane + gaze * plan->fields;
+            read(image, height, width, at, set, gaze, 0, plan->above, NULL, channels, out, plane);
+            if (!plan->levels) continue;
+            read(pyramid, rows, line, at, set, gaze, plan->above, plan->fields, NULL, channels, out + plan->above, plane);
+            read(pyramid, rows, line, at, set, gaze, plan->fields, at->count, plan->blend, channels, out + plan->first, plane);
+        }
+        k += channels;
+    }
+    return free(image), free(pyramid), free(sum), room ? 0 : -1;
 }
 
 typedef struct { /* a log-polar retina's values, (planes, fields), and places on it, (2, count) */

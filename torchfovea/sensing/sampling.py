@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchfovea.machine import Loops, columns_of, loops
 from torchfovea.sensing.layout import LogPolar, Retina
@@ -18,16 +19,17 @@ __all__ = [
     "Rings",
     "Sampling",
     "constant",
-    "halved",
+    "halve",
     "place",
     "read",
+    "read_fields",
     "read_rings",
     "ring_numbers",
     "sampling",
     "wide",
 ]
 
-F = TypeVar("F", bound=Callable[..., Any])
+_F = TypeVar("_F", bound=Callable[..., Any])
 
 
 class Sampling(NamedTuple):
@@ -56,7 +58,7 @@ def wide(dtype: torch.dtype) -> torch.dtype:
     return torch.promote_types(dtype, torch.float32)
 
 
-def constant(function: F) -> F:
+def constant(function: _F) -> _F:
     """Mark a function whose result depends on constants alone, so that torch.compile keeps it instead of tracing it.
 
     As `torch.compiler.assume_constant_result` does, whose import takes seconds.
@@ -75,7 +77,8 @@ def read(image: Tensor, maps: Tensor) -> Tensor:
     """(B, C, G, P) of images (B, C, H, W) at places (2, B or 1, G, P), the border's value beyond it."""
     library = loops(image, maps)
     if library is not None:
-        return _by_loops(library, image, maps)
+        count = maps.shape[-1]
+        return _by_loops(library, image, maps, (count, 0, count, count, None))
     # kornia takes as long to import as this whole package; only who looks needs it
     from kornia.geometry.transform import remap
 
@@ -84,30 +87,56 @@ def read(image: Tensor, maps: Tensor) -> Tensor:
     return seen
 
 
-def _by_loops(library: Loops, image: Tensor, maps: Tensor) -> Tensor:
-    """`read` by the loop of sampling.c."""
-    x, y = maps.expand(-1, len(image), -1, -1)
-    seen = image.new_empty(*image.shape[:2], *x.shape[1:])
-    library("read_bilinear", _planes(image.contiguous()), image.shape[1], (x, y, *x.shape, *x.stride()), seen)
-    return seen
+def read_fields(image: Tensor, maps: Tensor, plan: Sampling) -> Tensor:
+    """What RFs see, (B, C, G, N), of images (B, C, H, W) at a plan's places. Differentiable."""
+    library = loops(image, maps)
+    if library is not None:
+        return _by_loops(library, image, maps, (plan.fields, plan.levels, plan.first, plan.above, plan.blend))
+    values = read(image, maps[..., : plan.above])
+    if not plan.levels:
+        return values
+    higher = read(_pyramid(image, plan.levels), maps[..., plan.above :])
+    fine, coarse = higher[..., : plan.fields - plan.above], higher[..., plan.fields - plan.above :]
+    blended = torch.lerp(torch.cat([values[..., plan.first :], fine], -1), coarse, plan.blend)
+    return torch.cat([values[..., : plan.first], blended], -1)
 
 
-def halved(image: Tensor, levels: int) -> Tensor | None:
-    """Levels 1…`levels` of the pyramid of images (B, C, H, W), one below the other, by the loop of sampling.c.
+def halve(image: Tensor) -> Tensor:
+    """The next level of the pyramid, ⌈H/2⌉ × ⌈W/2⌉; replicated beyond the border."""
+    return _halve_along(_halve_along(image, -2), -1) / 64
 
-    None where there is no such loop, see `torchfovea.machine.loops`.
-    """
-    library = loops(image)
-    if library is None:
-        return None
-    level, heights = image.contiguous(), [image.shape[-2]]
+
+def _halve_along(image: Tensor, dim: int) -> Tensor:
+    """Weights (1, 3, 3, 1) at every second pixel; slices are faster here than a convolution."""
+    if image.shape[dim] % 2:
+        image = torch.cat([image, image.narrow(dim, -1, 1)], dim)
+    pairs: Tensor = image.unflatten(dim, (-1, 2))
+    even, odd = pairs.unbind(dim)
+    count = even.shape[dim]
+    out = (even + odd).mul_(3)
+    out.narrow(dim, 1, count - 1).add_(odd.narrow(dim, 0, count - 1))
+    out.narrow(dim, 0, count - 1).add_(even.narrow(dim, 1, count - 1))
+    out.narrow(dim, 0, 1).add_(even.narrow(dim, 0, 1))
+    out.narrow(dim, -1, 1).add_(odd.narrow(dim, -1, 1))
+    return out
+
+
+def _pyramid(image: Tensor, levels: int) -> Tensor:
+    """Levels 1…`levels` of the pyramid, one below the other."""
+    parts, width = [], (image.shape[-1] + 1) // 2
     for _ in range(levels):
-        heights.append((heights[-1] + 1) // 2)
-    pyramid = image.new_empty(*image.shape[:2], sum(heights[1:]), (image.shape[-1] + 1) // 2)
-    for rows in pyramid.split(heights[1:], -2):
-        library("halve", _planes(level), rows, rows.stride(1), rows.stride(2))
-        level = rows[..., : (level.shape[-1] + 1) // 2]
-    return pyramid
+        image = halve(image)
+        parts.append(pad(image, (0, width - image.shape[-1])))
+    return torch.cat(parts, -2)
+
+
+def _by_loops(library: Loops, image: Tensor, maps: Tensor, plan: tuple[int, int, int, int, Tensor | None]) -> Tensor:
+    """`read_fields` by a plan as sampling.c wants it."""
+    image = image if image.stride(-1) == 1 else image.contiguous()
+    x, y = maps.expand(-1, len(image), -1, -1)
+    values = image.new_empty(*image.shape[:2], x.shape[1], plan[0])
+    library("look", (*image.shape, *image.stride()[:3], image), (x, y, *x.shape, *x.stride()), plan, values)
+    return values
 
 
 def read_rings(values: Tensor, rings: Rings, px: Tensor) -> Tensor | None:
@@ -122,11 +151,6 @@ def read_rings(values: Tensor, rings: Rings, px: Tensor) -> Tensor | None:
     sizes = (values.shape[:2].numel(), values.shape[-1], rings.fovea_count, *rings.shape, len(px))
     library("read_rings", (*sizes, values.contiguous(), columns_of(px), rings.innermost_px, rings.growth), seen)
     return seen
-
-
-def _planes(image: Tensor) -> tuple[int | Tensor, ...]:
-    """Images (B, C, H, W) as sampling.c wants them, whose rows may be parts of longer ones."""
-    return (image.shape[:2].numel(), *image.shape[2:], *image.stride()[1:3], image)
 
 
 class Rings(NamedTuple):

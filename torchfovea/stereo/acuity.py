@@ -13,7 +13,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchfovea.gaussian import columns
-from torchfovea.sensing.retina import Retina, halve
+from torchfovea.sensing.retina import Retina
+from torchfovea.sensing.sampling import halve
 
 __all__ = ["acuity", "level_of"]
 
