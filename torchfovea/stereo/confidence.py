@@ -90,14 +90,11 @@ def field_clues(values: Tensor, valid: Tensor, px_per_value: Tensor, retina: Ret
         wider). What lies beyond the retina is no hole.
     """
     around, radius_px, on = _surroundings(retina, source_pitch_px, values.device)
-    nearer, farther, holes = (torch.zeros_like(values) for _ in range(3))
-    for k in range(DIRECTIONS // 2):
-        one, other = around[k], around[k + DIRECTIONS // 2]
-        both = valid[:, one] & valid[:, other]
-        departs = torch.where(both, values - (values[:, one] + values[:, other]) / 2, torch.zeros_like(values))
-        nearer, farther = torch.maximum(nearer, departs), torch.maximum(farther, -departs)
-        for which, there in ((k, one), (k + DIRECTIONS // 2, other)):
-            holes = holes + (on[which] & ~valid[:, there]).to(holes)
+    told = torch.where(valid, values, math.nan).index_select(1, around.flatten()).view(-1, *around.shape)
+    one, other = told.chunk(2, 1)
+    departs = (values[:, None] - (one + other) / 2).nan_to_num_(0.0)
+    nearer, farther = departs.amax(1).clamp(min=0), departs.amin(1).neg().clamp(min=0)
+    holes = (on & told.isnan()).sum(1).to(values)
     gap_px = radius_px.to(holes) * holes / DIRECTIONS
     return Clues(torch.maximum(nearer, farther) * px_per_value, gap_px, nearer * px_per_value)
 

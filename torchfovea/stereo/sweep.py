@@ -124,9 +124,11 @@ def match_sweep(
     parts = [
         match_sheet(eye, sheet, params, low, high) for sheet in sheets(retina, 1 / eye.scale, pair.device, pair.dtype)
     ]
-    order = torch.cat([rf for rf, _, _ in parts]).argsort()
-    rho, variance, correlation, unit, misfit = torch.cat([values for _, values, _ in parts], -1)[..., order].unbind(1)
-    valid = torch.cat([found for _, _, found in parts], -1)[..., order]
+    rf = torch.cat([own for own, _, _ in parts])
+    order = torch.empty_like(rf).scatter_(0, rf, torch.arange(len(rf), device=rf.device))
+    values = torch.cat([values for _, values, _ in parts], -1)
+    rho, variance, correlation, unit, misfit = values.gather(-1, order.expand_as(values)).unbind(1)
+    valid = torch.cat([found for _, _, found in parts], -1)[:, order]
 
     sigma = torch.where(valid, variance, torch.ones_like(variance)).sqrt()
     u, v, seen = project(eye, ray, torch.stack([rho - sigma, rho, rho + sigma], 1))
