@@ -49,7 +49,7 @@ def test_the_variance_law_is_that_of_observe(fov_deg, uniform):
     expected = observe(matches, pose, seer.camera, seer.retina.width_px(left) / 2)
     range_m = point.norm(dim=-1)
     batch = Eyes(*(part[None] for part in pose))
-    found, variance = glance(seer, batch, point[None], (point / range_m[:, None])[None], range_m[None])
+    found, variance = glance(seer, batch, (point / range_m[:, None])[None], range_m[None])
     assert torch.equal(found[0], expected.valid)
     ratio = (variance[0] / expected.cov[:, 5])[expected.valid]
     assert expected.valid.sum() > 300
@@ -127,10 +127,7 @@ def episode_by_loop(task, scenes, b, world, alpha):
         rewards.append(-task.far_m if kind == "floor" else -min(np.linalg.norm(point), task.far_m))
         for i in range(cells):
             direction, range_m = world.direction[b, i], world.range_m[b, i]
-            place = (direction * range_m)[None, None]
-            visible, variance = glance(
-                task.observer, eyes(head, gaze), place, direction[None, None], range_m[None, None]
-            )
+            visible, variance = glance(task.observer, eyes(head, gaze), direction[None, None], range_m[None, None])
             if bool(visible):
                 v = float(variance)
                 precision[i] += 1 / v

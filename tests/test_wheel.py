@@ -32,7 +32,7 @@ def test_the_wheel_holds_the_package_and_all_of_conf(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     for source in (ROOT / "conf").rglob("*.yaml"):
         assert f"torchfovea/{source.relative_to(ROOT)}" in names
-    for source in (path for kind in ("*.py", "*.c") for path in (ROOT / "torchfovea").rglob(kind)):
+    for source in (path for kind in ("*.py", "*.c", "*.h") for path in (ROOT / "torchfovea").rglob(kind)):
         assert str(source.relative_to(ROOT)) in names
     assert "torchfovea/py.typed" in names  # whoever builds on it is type-checked against it
     tops = {name.partition("/")[0] for name in names}

@@ -109,19 +109,19 @@ def _say_once(why: str) -> None:
 @lru_cache(maxsize=2)
 def _built(real: str) -> Loops | str:
     """The loops, built or from the disk; or why there are none."""
-    sources = sorted(Path(__file__).parent.rglob("*.c"))
+    folder = Path(__file__).parent
+    sources, headers = (sorted(folder.rglob(kind)) for kind in ("*.c", "*.h"))
     compiler = shlex.split(os.environ.get("CC", "cc"))
     try:
         native = _runs([*compiler, "-march=native", "-dM", "-E", "-x", "c", os.devnull])
         command = [*compiler, *_FLAGS, *(["-march=native"] if native else []), f"-DREAL={real}"]
         macros = native or _runs([*compiler, "-dM", "-E", "-x", "c", os.devnull]) or b""
-        texts = [source.read_bytes() for source in sources]
+        texts = [source.read_bytes() for source in (*sources, *headers)]
         key = hashlib.sha256(b"\0".join([*texts, macros, *map(os.fsencode, command)])).hexdigest()[:32]
-        folder = cache_folder()
-        kept = folder / f"loops-{key}.so"
+        kept = cache_folder() / f"loops-{key}.so"
         if not kept.is_file():
-            folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(dir=folder) as aside:
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=kept.parent) as aside:
                 made = Path(aside) / kept.name
                 done = subprocess.run(
                     [*command, *map(str, sources), "-o", str(made), "-lm"], capture_output=True, text=True, check=False

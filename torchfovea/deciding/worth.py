@@ -30,7 +30,7 @@ from torchfovea.memory.egosphere import (
     reducible,
     trust,
 )
-from torchfovea.sensing.head import FARTHEST_M, Head, Kinematics, can_fixate, turns_of
+from torchfovea.sensing.head import Head, Kinematics, can_fixate, reach_numbers
 
 __all__ = ["Appraisal", "appraise", "worth_of_cells"]
 
@@ -116,8 +116,6 @@ def _by_loops(library: Loops, memory: Memory, measure: str, head: Head, limits: 
     mean, std = map(float, range_from_inverse_range(then) if measure == "range" else then)
     ground = (head.ego_height_m, limits.ground_z_m, limits.ground_sigmas)
     numbers = (FAR_M, torch.finfo(cells.dtype).tiny, *ground, limits.nearest_m, mean, std, 1 / prior.mean)
-    turns = (angle for pair in turns_of(head) for angle in pair)
-    reach = (head.eyes_up_m, head.eyes_forward_m, head.nearest_m, FARTHEST_M, *turns)
     points, cov, reward, target = (cells.new_empty(parts, *shape) for parts in (3, 6, 3, 3))
     eligible, incumbent = torch.empty(shape, dtype=torch.bool), cells.new_empty(shape[:-1])
     given = (*map(float, numbers), int(measure == "range"))
@@ -125,7 +123,7 @@ def _by_loops(library: Loops, memory: Memory, measure: str, head: Head, limits: 
         "appraise",
         known,
         given,
-        tuple(map(float, reach)),
+        reach_numbers(head),
         (points, cov, *reward.unbind(0), target, eligible, incumbent),
     )
     beliefs = Gaussian(points.movedim(0, -1), cov.movedim(0, -1)), RewardBelief(reward[0], reward[1])

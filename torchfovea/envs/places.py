@@ -142,8 +142,7 @@ class CellPlaces(GeometricPlaces):
     ) -> tuple[Memory, Look | None]:
         """See `SearchPlaces`."""
         pose, range_m = eyes(self.observer.head, gaze), self.range_m[list(rows)]
-        point = memory.cells * range_m[..., None]
-        visible, variance = glance(self.observer, pose, point, memory.cells, range_m)
+        visible, variance = glance(self.observer, pose, memory.cells, range_m)
         noise = torch.stack([torch.randn(range_m.shape[1:], generator=g, dtype=range_m.dtype) for g in generators])
         measured = 1 / range_m + variance.sqrt() * noise.to(range_m)
         weight, zero = visible / variance, torch.zeros_like(range_m)

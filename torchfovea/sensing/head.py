@@ -29,6 +29,7 @@ __all__ = [
     "eyes",
     "fixate",
     "gaze_point",
+    "reach_numbers",
     "rig_frame",
     "to_ego",
     "turns_of",
@@ -185,7 +186,16 @@ def can_fixate(head: Head | Kinematics, point: Tensor) -> Tensor:
     Raises:
         SettingError: for a point of another shape or type.
     """
-    return (_aim(head, point.detach()) if isinstance(head, Head) else head.fixate(point.detach()))[-1]
+    if not isinstance(head, Head):
+        return head.fixate(point.detach())[-1]
+    _check_point(point)
+    with torch.no_grad():
+        x, y, z = point.unbind(-1)
+        less = FARTHEST_M / _largest(x, y, z).clamp(min=FARTHEST_M)
+        x, y, z = x * less, y * less, z * less
+        side, ahead = _squares(head, x, y, z)
+        # no comparison passes NaN: a square that has no root, a point that is not finite
+        return _within(head, x, y, z, side.sqrt(), ahead.sqrt()) & _solvable(head, side, ahead)
 
 
 def _limits_deg(head: Head) -> tuple[float, float, float]:
@@ -200,6 +210,12 @@ def turns_of(head: Head) -> tuple[tuple[float, float], ...]:
     return tuple((math.sin(math.radians(a)), math.cos(math.radians(a))) for a in reached)
 
 
+def reach_numbers(head: Head) -> tuple[float, ...]:
+    """How loops in C are told what a head can fixate, see head.h."""
+    turns = (angle for pair in turns_of(head) for angle in pair)
+    return tuple(map(float, (head.eyes_up_m, head.eyes_forward_m, head.nearest_m, FARTHEST_M, *turns)))
+
+
 def _aim(head: Head, point: Tensor) -> tuple[tuple[Tensor, ...], Tensor, Tensor, Tensor, Tensor]:
     """A point as the head's inverse kinematics wants it.
 
@@ -207,30 +223,53 @@ def _aim(head: Head, point: Tensor) -> tuple[tuple[Tensor, ...], Tensor, Tensor,
         x, y and z; √(x² + y²); √(|X|² − up²), how far before the tilt axis the gaze meets it; whether there is a gaze
         at all; whether it lies within the limits. Where there is none the numbers are 1.
     """
-    good = point.dim() >= 1 and point.shape[-1] == 3 and point.dtype in (torch.float32, torch.float64)
-    require(good, "point", f"{tuple(point.shape)} {point.dtype}", "a tensor (..., 3) of torch.float32 or torch.float64")
+    _check_point(point)
     x, y, z = point.unbind(-1)
     with torch.no_grad():
-        largest = torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs())
+        largest = _largest(x, y, z)
         finite = largest < math.inf
         # all angles are there long before squares overflow; what is not finite counts as a point at the origin
         less = torch.where(finite, FARTHEST_M / largest.clamp(min=FARTHEST_M), 0.0)
     one = torch.ones_like(x)
     x, y, z = (torch.where(finite, c, one) * less for c in (x, y, z))
-    up, forward = head.eyes_up_m, head.eyes_forward_m
-    # in the neck's vertical plane the point is at (d + forward, up): |X|² = (d + forward)² + up²
-    side = x * x + y * y
-    ahead = side + z * z - up * up
-    solvable = (side > 1e-12) & (ahead > max(forward + 1e-3, 1e-3) ** 2)
+    side, ahead = _squares(head, x, y, z)
+    solvable = _solvable(head, side, ahead)
     x, y, z = (torch.where(solvable, c, one) for c in (x, y, z))
     side, reach = (torch.where(solvable, square, one).sqrt() for square in (side, ahead))
     with torch.no_grad():
-        # angles α ≤ β where sin(β − α) ≥ 0: of pan, and of tilt, the angle from (side, z) to (reach, up)
-        (pan_s, pan_c), (up_s, up_c), (down_s, down_c) = turns_of(head)
-        sine, cosine = up * side - reach * z, reach * side + up * z
-        within = (pan_s * x >= pan_c * y.abs()) & (up_c * sine >= up_s * cosine) & (down_c * sine <= down_s * cosine)
-        within &= solvable & (reach - forward >= head.nearest_m)
+        within = solvable & _within(head, x, y, z, side, reach)
     return (x, y, z), side, reach, solvable, within
+
+
+def _check_point(point: Tensor) -> None:
+    good = point.dim() >= 1 and point.shape[-1] == 3 and point.dtype in (torch.float32, torch.float64)
+    require(good, "point", f"{tuple(point.shape)} {point.dtype}", "a tensor (..., 3) of torch.float32 or torch.float64")
+
+
+def _largest(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+    return torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs())
+
+
+def _squares(head: Head, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+    """In the neck's vertical plane a point is at (d + forward, up): x² + y², and |X|² − up² = (d + forward)²."""
+    side = x * x + y * y
+    return side, side + z * z - head.eyes_up_m**2
+
+
+def _solvable(head: Head, side: Tensor, ahead: Tensor) -> Tensor:
+    """Whether there is a gaze at all."""
+    return (side > 1e-12) & (ahead > max(head.eyes_forward_m + 1e-3, 1e-3) ** 2)
+
+
+def _within(head: Head, x: Tensor, y: Tensor, z: Tensor, side: Tensor, reach: Tensor) -> Tensor:
+    """Whether a gaze lies within the limits: angles α ≤ β where sin(β − α) ≥ 0.
+
+    They are those of pan, and of tilt, the angle from (side, z) to (reach, up).
+    """
+    up, (pan_s, pan_c), (up_s, up_c), (down_s, down_c) = head.eyes_up_m, *turns_of(head)
+    sine, cosine = up * side - reach * z, reach * side + up * z
+    within = (pan_s * x >= pan_c * y.abs()) & (up_c * sine >= up_s * cosine) & (down_c * sine <= down_s * cosine)
+    return within & (reach - head.eyes_forward_m >= head.nearest_m)
 
 
 def gaze_point(head: Head | Kinematics, gaze: Gaze) -> Tensor:

@@ -156,6 +156,11 @@ class LogPolar:
         """Spacing of the uniform fovea's lattice [px]; 0 without one."""
         return self.rho_min_px / fovea_lattice(self.fovea_count)[0] if self.fovea_count else 0.0
 
+    @property
+    def width_law(self) -> tuple[float, float]:
+        """How much wider RFs are for every px of eccentricity, and how wide they are at least [px]."""
+        return (self.base - 1) / math.sqrt(self.base), self.fovea_pitch_px or self.rho_min_px * (self.base - 1)
+
     def centers_px(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Tensor:
         """Centres of the RFs, (N, 2) [px]. Built once; do not write into it."""
         return _centers(self, torch.device(device or "cpu"), dtype or torch.get_default_dtype())
@@ -166,8 +171,7 @@ class LogPolar:
         The continuous law W(ρ) = ρ (a−1)/√a, which is W_i at ring i's centre. Towards the axis it stops at the first
         ring's width, or at the pitch of the uniform fovea. Differentiable.
         """
-        slope = (self.base - 1) / math.sqrt(self.base)
-        smallest = self.fovea_pitch_px or self.rho_min_px * (self.base - 1)
+        slope, smallest = self.width_law
         # the floor is under the root: its gradient at the axis is 0, not NaN
         return slope * _square(px).clamp(min=(smallest / slope) ** 2).sqrt()
 
@@ -200,6 +204,11 @@ class Uniform:
     def pitch_px(self) -> float:
         """Spacing and width of the RFs [px]."""
         return self.radius_px / disc_lattice(self.receptive_fields)[0]
+
+    @property
+    def width_law(self) -> tuple[float, float]:
+        """As of `LogPolar`: RFs do not grow."""
+        return 0.0, self.pitch_px
 
     @property
     def count(self) -> int:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchfovea.sensing.head import Head, can_fixate
+from torchfovea.machine import loops
+from torchfovea.sensing.head import Head, can_fixate, reach_numbers
 from torchfovea.setting import require
 from torchfovea.tuning.bias import Bias
 
@@ -15,6 +17,14 @@ __all__ = ["draw_cells", "reachable"]
 
 REACH_RANGE_M = 1.0  # as in `torchfovea.commands.shared.build`: a direction is reachable if its point at 1 m is
 _FEWEST_ACCEPTED = 1e-3
+
+
+class _Mixtures(NamedTuple):
+    """One mixture for all scenes, or one for each: edges of the components' shares, means and Cholesky factors."""
+
+    edges: Tensor
+    means: Tensor
+    factor: Tensor
 
 
 def reachable(head: Head, directions: Tensor) -> Tensor:
@@ -41,30 +51,15 @@ def draw_cells(
     Raises:
         SettingError: where hardly any draw is reachable.
     """
-    dtype, m = bias.means.dtype, bias.means.shape[1]
-    logits, means, factor = (t.detach().expand(scenes, *t.shape[1:]) for t in (bias.logits, bias.means, bias.cholesky))
-    edges = logits.softmax(-1).cumsum(-1)
-    direction = torch.zeros(scenes, cells, 3, dtype=dtype)
+    mixtures = _Mixtures(bias.logits.detach().softmax(-1).cumsum(-1), bias.means.detach(), bias.cholesky.detach())
+    direction = torch.zeros(scenes, cells, 3, dtype=bias.means.dtype)
     waiting, tried, block = torch.arange(scenes * cells), 0, 4
     seed = torch.randint(2**62, (), generator=generator)
     while len(waiting):
-        counter = waiting * 2**20 + torch.arange(tried, tried + block)[:, None]
-        draws = torch.stack((*_normal(seed + 2, counter, dtype), _normal(seed + 3, counter, dtype)[0]), -1)
-        if len(bias.means) == m == 1:
-            v = means[0, 0] + draws @ factor[0, 0].mT
-        else:
-            scene = (waiting // cells).expand_as(counter)
-            lot = _uniform(seed + 1, counter, dtype)[0]
-            component = (lot[..., None] > edges[scene]).sum(-1).clamp(max=m - 1)
-            v = means[scene, component] + (factor[scene, component] @ draws[..., None])[..., 0]
-        unit = torch.nn.functional.normalize(v, dim=-1)
-        good = reachable(head, unit)
+        good, unit = _first_draws(mixtures, cells, head, seed, waiting, range(tried, tried + block))
+        direction.view(-1, 3)[waiting[good]] = unit[good]
+        waiting = waiting[~good]
         tried, block = tried + block, min(2 * block, 64)
-        order = torch.arange(len(good))[:, None]
-        first = torch.where(good, order, len(good)).amin(0)
-        any_good = first < len(good)
-        direction.view(-1, 3)[waiting[any_good]] = unit[first[any_good], any_good.nonzero()[:, 0]]
-        waiting = waiting[~any_good]
         filled = 1 - len(waiting) / (scenes * cells)
         # a share s of reachable draws would have filled 1 − (1 − s)^tried by now
         enough = tried < 512 or filled > 1 - (1 - _FEWEST_ACCEPTED) ** tried
@@ -78,6 +73,34 @@ def draw_cells(
             "at least one draw in a thousand within the head's reach: the bias and the reachable set do not overlap",
         )
     return direction
+
+
+def _first_draws(
+    mixtures: _Mixtures, cells: int, head: Head, seed: Tensor, slots: Tensor, numbers: range
+) -> tuple[Tensor, Tensor]:
+    """Which of K slots have a draw within reach among those of some numbers, bool (K,), and the first one, (K, 3)."""
+    library = loops(*mixtures)
+    if library is not None and isinstance(head, Head):
+        unit, good = mixtures.means.new_zeros(len(slots), 3), torch.empty(len(slots), dtype=torch.bool)
+        given = (*mixtures.edges.shape, *(part.contiguous() for part in mixtures))
+        draws = (len(slots), cells, slots, numbers.start, numbers.stop, unit, good)
+        library("draw_cells", given, reach_numbers(head), int(seed), draws)
+        return good, unit
+    (edges, means, factor), dtype = mixtures, mixtures.means.dtype
+    sets, m = edges.shape
+    counter = slots * 2**20 + torch.arange(numbers.start, numbers.stop)[:, None]
+    normal = torch.stack((*_normal(seed + 2, counter, dtype), _normal(seed + 3, counter, dtype)[0]), -1)
+    if sets == m == 1:
+        v = means[0, 0] + normal @ factor[0, 0].mT
+    else:
+        scene = (slots // cells if sets > 1 else torch.zeros_like(slots)).expand_as(counter)
+        lot = _uniform(seed + 1, counter, dtype)[0]
+        component = (lot[..., None] > edges[scene]).sum(-1).clamp(max=m - 1)
+        v = means[scene, component] + (factor[scene, component] @ normal[..., None])[..., 0]
+    unit = torch.nn.functional.normalize(v, dim=-1)
+    within = reachable(head, unit)
+    first = within.to(torch.uint8).argmax(0)  # of equals
+    return within.any(0), unit[first, torch.arange(len(slots))]
 
 
 def _uniform(seed: Tensor, counter: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:

@@ -67,13 +67,12 @@ def myopic(problem: Problem, vector: Tensor, batch: Batch, alpha_share: float = 
     world = world_of(task, batch.scenes, direction, noise)
     looks = [Gaze(*(a[:, k] for a in base.gaze)) for k in range(steps - 1)]
     point = direction * world.range_m[..., None]
-    seen = [glance(observer, eyes(observer.head, g), point, direction, world.range_m) for g in looks]
+    seen = [glance(observer, eyes(observer.head, g), direction, world.range_m) for g in looks]
     visible, variance = (torch.stack(parts, -1) for parts in zip(*seen, strict=True))
-    each = point.reshape(-1, 1, 3)
-    pose = eyes(observer.head, fixate(observer.head, each[:, 0])[0])
+    pose = eyes(observer.head, fixate(observer.head, point.reshape(-1, 3))[0])
     self_visible, self_variance = (
         part.reshape(n, candidates)
-        for part in glance(observer, pose, each, direction.reshape(-1, 1, 3), world.range_m.reshape(-1, 1))
+        for part in glance(observer, pose, direction.reshape(-1, 1, 3), world.range_m.reshape(-1, 1))
     )
     floor = point[..., 2] + observer.head.ego_height_m < 1e-3
     reward = -torch.where(floor, torch.full_like(world.range_m, task.far_m), world.range_m).clamp(max=task.far_m)

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.gaussian import columns
+from torchfovea.machine import columns_of, loops
 from torchfovea.sensing.head import Head, can_fixate
 from torchfovea.setting import check_types, require, require_name
 
@@ -282,6 +283,14 @@ def first_surfaces(scenes: Scenes, origin: Tensor, direction: Tensor) -> Hits:
     Returns:
         (B, K). The range is differentiable where the surface does not change.
     """
+    library = loops(*scenes[:5], origin, direction)
+    if library is not None:
+        given = (*scenes.x.shape, *(part.contiguous() for part in scenes[:5]), *map(float, scenes.walls))
+        kinds = (direction.dtype, torch.bool, torch.int64)
+        hits = Hits(*(torch.empty(direction.shape[:-1], dtype=kind) for kind in kinds))
+        rays = (direction.shape[1], columns_of(direction), origin.shape[1], columns_of(origin))
+        library("first_surfaces", given, rays, tuple(hits))
+        return hits
     front, back, side, floor, ceiling = scenes.walls
     ox, oy, oz = origin.unbind(-1)
     dx, dy, dz = direction.unbind(-1)
@@ -306,7 +315,6 @@ def first_surfaces(scenes: Scenes, origin: Tensor, direction: Tensor) -> Hits:
     on_side = hits & (entry > 0) & (z >= low) & (z <= high)
     cap = torch.where(sz > 0, low - oz, high - oz) / sz
     on_cap = hits & (cap > 0) & (cap >= entry) & (cap <= leave)
-    infinite = torch.full_like(entry, math.inf)
-    nearest, which = torch.minimum(torch.where(on_side, entry, infinite), torch.where(on_cap, cap, infinite)).min(-1)
+    nearest, which = torch.minimum(torch.where(on_side, entry, math.inf), torch.where(on_cap, cap, math.inf)).min(-1)
     on_can = nearest < best
     return Hits(torch.where(on_can, nearest, best), down & ~on_can, which.masked_fill(~on_can, -1))

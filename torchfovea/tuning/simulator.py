@@ -16,6 +16,7 @@ from torchfovea.metrics import gap
 from torchfovea.sensing.camera import Pinhole
 from torchfovea.sensing.head import Gaze, can_fixate, cyclopean, eyes, fixate
 from torchfovea.setting import require
+from torchfovea.tuning.episodes import Course, episode_loops, play_by_loops
 from torchfovea.tuning.scenes import Scenes, first_surfaces
 from torchfovea.tuning.worlds import Known, Task, Worlds, empty, look
 
@@ -197,21 +198,38 @@ def simulate(
     """
     n, steps = len(scenes.nearest_m), task.saccades
     require(start is None or not keep, "keep", keep, "False for runs that begin later")
-    zero = torch.zeros_like(scenes.nearest_m)
-    cells = torch.full((n, steps), -1)
-    scores = torch.full((n, steps), -math.inf, dtype=zero.dtype)
-    angles = torch.zeros(3, n, steps, dtype=zero.dtype)
+    weights = weights.each(lambda weight: weight.to(scenes.nearest_m).expand(n))
+    angles, made = scenes.nearest_m.new_zeros(3, n, steps), None if start is None else start.made
+    memory = empty(world) if start is None else start.memory
+    if start is not None:
+        angles = torch.stack(start.gaze) * (torch.arange(steps) <= start.made[:, None])
+    library = episode_loops(task.observer, world, weights)
+    if library is not None:
+        course = play_by_loops(library, task.observer, world, weights, memory, made, angles, _FAR_M, keep)
+    else:
+        course = _play(task, world, weights, memory, made, angles, keep)
+    gaze = Gaze(*course.angles)
+    reward = true_reward(task, scenes, gaze)
+    if start is not None:
+        reward = torch.where(torch.arange(steps) > start.made[:, None], reward, start.reward)
+    value = worth(task, reward, scenes.nearest_m, gaze)
+    return Run(value, reward, course.cell, course.score, gaze, course.memories)
+
+
+def _play(
+    task: Task, world: Worlds, weights: Weighting, memory: Known, made: Tensor | None, angles: Tensor, keep: bool
+) -> Course:
+    """The episodes, see `torchfovea.tuning.episodes.play_by_loops`."""
+    _, n, steps = angles.shape
+    cells, scores = torch.full((n, steps), -1), torch.full((n, steps), -math.inf, dtype=angles.dtype)
     memories: list[Known] = []
-    weights = weights.each(lambda weight: weight.to(zero).expand(n))
-    if start is None:
-        memory = look(task, world, empty(world), eyes(task.observer.head, Gaze(zero, zero, zero)), 0)
+    if made is None:
+        memory = look(task, world, memory, eyes(task.observer.head, Gaze(*angles[..., 0])), 0)
         order, made = torch.arange(n), torch.zeros(n, dtype=torch.long)
     else:
-        memory, made = start.memory, start.made
         order = made.argsort(stable=True)  # those that begin first come first: the live ones are a slice
         memory, world = Known(*(m[order] for m in memory)), world.take(order)
-        weights, made = _rows(weights, order), made[order]
-        angles = torch.stack(start.gaze)[:, order] * (torch.arange(steps) <= made[:, None])
+        weights, made, angles = _rows(weights, order), made[order], angles[:, order]
     precision = foreseen(task, world) if weights.counts("information") else None
     for t in range(steps - 1):
         live = int((made <= t).sum())
@@ -236,8 +254,4 @@ def simulate(
             m = look(task, w, m, eyes(task.observer.head, now), t + 1)
             memory = m if live == n else Known(*(torch.cat((a, b[live:])) for a, b in zip(m, memory, strict=True)))
     back = order.argsort()
-    cells, scores, gaze, made = cells[back], scores[back], Gaze(*angles[:, back]), made[back]
-    reward = true_reward(task, scenes, gaze)
-    if start is not None:
-        reward = torch.where(torch.arange(steps) > made[:, None], reward, start.reward)
-    return Run(worth(task, reward, scenes.nearest_m, gaze), reward, cells, scores, gaze, memories)
+    return Course(cells[back], scores[back], angles[:, back], memories)

@@ -15,14 +15,16 @@ import torch
 from torch import Tensor
 
 from torchfovea.gaussian import columns
+from torchfovea.machine import Loops, columns_of, loops
 from torchfovea.perception import Observer
 from torchfovea.sensing.camera import Pinhole
 from torchfovea.sensing.correspondence import eye_sigma_px
 from torchfovea.sensing.head import Eyes, rig_frame
+from torchfovea.sensing.layout import LogPolar, Uniform
 from torchfovea.setting import require
 from torchfovea.tuning.scenes import Scenes, first_surfaces
 
-__all__ = ["Known", "Task", "Worlds", "check_observer", "empty", "glance", "look", "world_of"]
+__all__ = ["Known", "Task", "Worlds", "check_observer", "empty", "glance", "look", "sensor_numbers", "world_of"]
 
 
 class Task(NamedTuple):
@@ -104,7 +106,7 @@ def world_of(task: Task, scenes: Scenes, cells: Tensor, noise: Tensor) -> Worlds
     return Worlds(cells, hits.range_m, noise, torch.ones_like(hits.floor), mean, precision)
 
 
-def glance(observer: Observer, pose: Eyes, point: Tensor, direction: Tensor, range_m: Tensor) -> tuple[Tensor, Tensor]:
+def glance(observer: Observer, pose: Eyes, direction: Tensor, range_m: Tensor) -> tuple[Tensor, Tensor]:
     """Which points both retinas see, and the variance of their inverse range, to first order.
 
     In the rig's frame, with slopes u = x/z and v = y/z of the eyes' rays, the point is Z ((u + u')/2, (v + v')/2, 1)
@@ -114,45 +116,72 @@ def glance(observer: Observer, pose: Eyes, point: Tensor, direction: Tensor, ran
     Args:
         observer: camera, retina and error budget.
         pose: of the eyes, (B, ...).
-        point: (B, N, 3) in E [m].
-        direction: of the points from E, unit (B, N, 3).
-        range_m: (B, N).
+        direction: of the points from E, unit (B, N, 3); fast where its components are contiguous.
+        range_m: how far they are (B, N).
 
     Returns:
         bool (B, N) and (B, N) [1/m²], finite everywhere. Differentiable.
     """
+    if isinstance(observer.retina, LogPolar | Uniform):
+        library = loops(direction, range_m, *pose)
+        if library is not None:
+            return _glance_by_loops(library, observer, pose, direction, range_m)
     focal, retina = observer.camera.focal_px, observer.retina
     frame, middle, baseline = rig_frame(pose)
-    half = baseline[..., None] / 2
-    x, y, z = ((point - middle.unsqueeze(-2)) @ frame).unbind(-1)
-    ux, uy, uz = (direction @ frame).unbind(-1)
-    ahead = z > 1e-3
-    depth = torch.where(ahead, z, torch.ones_like(z))
-    v = y / depth
-    # of the range: by the slopes' mean and by their difference
-    along = ux * x + uy * y + uz * depth
-    by_mean, by_disparity, by_v = depth * ux / 2, depth * along / (2 * half), depth * uy / 2
-    visible = ahead
-    spread = torch.zeros_like(range_m)
-    for rotation, centre, sign in ((pose.R_left, pose.t_left, 1.0), (pose.R_right, pose.t_right, -1.0)):
-        cx, cy, cz = ((point - centre.unsqueeze(-2)) @ rotation).unbind(-1)
-        forward = cz > 1e-3
-        distance = torch.where(forward, cz, torch.ones_like(cz))
-        px = focal * columns(cx / distance, cy / distance)
-        visible = visible & forward & retina.inside(px)
-        sigma = eye_sigma_px(observer.budget, retina, px) / focal * (distance / depth)
-        u, by_u = (x + sign * half) / depth, by_mean - sign * by_disparity
-        turned = frame.mT @ rotation
-        for axis in (0, 1):
-            ax, ay, az = (turned[..., k, axis, None] for k in range(3))
-            spread = spread + (sigma * (by_u * (ax - u * az) + by_v * (ay - v * az))).square()
-    return visible, (spread / range_m.square().square()).clamp(min=1e-12)
+    # axes as rows, (B, 9, 3): of the rig and of both eyes, from which all is seen at once
+    axes = torch.cat((frame, pose.R_left, pose.R_right), -1).mT
+    origin = torch.stack((middle, pose.t_left, pose.t_right), 1).repeat_interleave(3, 1)
+    along = axes @ direction.mT
+    place = torch.addcmul(-(axes * origin).sum(-1, keepdim=True), along, range_m[:, None])
+    (ux, uy, uz), (x, y, _) = along[:, :3].unbind(1), place[:, :3].unbind(1)
+    in_front = place[:, 2::3] > 1e-3
+    depths = torch.where(in_front, place[:, 2::3], 1.0)
+    depth = depths[:, :1]
+    # of the left eye and of the right one, (B, 2, N)
+    side = torch.stack((baseline, -baseline), -1)[..., None] / 2
+    shrink = focal / depths[:, 1:]
+    px = columns(place[:, 3::3] * shrink, place[:, 4::3] * shrink)
+    inside = retina.inside(px)
+    u, v = (x[:, None] + side) / depth, (y / depths[:, 0])[:, None]
+    # of the range: by the slopes' mean, by their difference and by v
+    reach = (ux * x + uy * y + uz * depths[:, 0])[:, None]
+    by_u, by_v = depth * (ux[:, None] / 2 - reach / (2 * side)), depth * (uy / 2)[:, None]
+    by_both = by_u * u + by_v * v
+    ax, ay, az = (axes[:, :3] @ axes[:, 3:].mT).unflatten(-1, (2, 3))[..., None].unbind(1)
+    across = ax[:, :, 0] * by_u + ay[:, :, 0] * by_v - az[:, :, 0] * by_both
+    upright = ax[:, :, 1] * by_u + ay[:, :, 1] * by_v - az[:, :, 1] * by_both
+    sigma = eye_sigma_px(observer.budget, retina, px) * (depths[:, 1:] / depth)
+    left, right = (sigma.square() * (across.square() + upright.square())).unbind(1)
+    visible = in_front[:, 0] & in_front[:, 1] & in_front[:, 2] & inside[:, 0] & inside[:, 1]
+    return visible, ((left + right) / (focal * range_m.square()).square()).clamp(min=1e-12)
+
+
+def _glance_by_loops(
+    library: Loops, observer: Observer, pose: Eyes, direction: Tensor, range_m: Tensor
+) -> tuple[Tensor, Tensor]:
+    frame, middle, baseline = rig_frame(pose)
+    middle, turned = middle[:, None] @ frame, torch.stack((pose.R_left, pose.R_right), 1).mT @ frame[:, None]
+    rig = torch.cat((frame.mT.flatten(1), middle[:, 0], baseline[:, None] / 2, turned.flatten(1)), 1)
+    visible, variance = torch.empty(range_m.shape, dtype=torch.bool), torch.empty_like(range_m)
+    given = (*range_m.shape, columns_of(direction), range_m.contiguous(), visible, variance)
+    library("glance", rig, sensor_numbers(observer), given)
+    return visible, variance
+
+
+def sensor_numbers(observer: Observer) -> tuple[float, ...]:
+    """How the loops are told the variance law of a retina of this package, see `torchfovea.sensing.eye_sigma_px`."""
+    retina, budget = observer.retina, observer.budget
+    assert isinstance(retina, LogPolar | Uniform)
+    slope, least = retina.width_law
+    source = 0.0 if budget.source_px is None else 2 * retina.radius_px / budget.source_px
+    own = budget.sigma_over_width**2
+    more = (own + budget.match_px**2) * source**2
+    return tuple(map(float, (observer.camera.focal_px, retina.radius_px, slope**2, least**2, own, more)))
 
 
 def look(task: Task, world: Worlds, memory: Known, pose: Eyes, t: int) -> Known:
     """Fuse one saccade's observations into the memory."""
-    point = world.direction * world.range_m[..., None]
-    visible, variance = glance(task.observer, pose, point, world.direction, world.range_m)
+    visible, variance = glance(task.observer, pose, world.direction, world.range_m)
     weight = visible / variance
     measured = 1 / world.range_m + variance.sqrt() * world.noise[t]
     return Known(memory.precision + weight, memory.vector + weight * measured, memory.seen | visible)
