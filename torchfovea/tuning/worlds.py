@@ -99,6 +99,7 @@ def empty(world: Worlds) -> Known:
 
 def world_of(task: Task, scenes: Scenes, cells: Tensor, noise: Tensor) -> Worlds:
     """Put cells (B, N, 3) into B scenes, with noise (T, B, N)."""
+    cells = columns(*cells.unbind(-1))
     hits = first_surfaces(scenes, torch.zeros_like(cells[:, :1]), cells)
     prior = task.observer.prior
     mean = torch.full_like(hits.range_m, prior.mean)
@@ -128,32 +129,32 @@ def glance(observer: Observer, pose: Eyes, direction: Tensor, range_m: Tensor) -
             return _glance_by_loops(library, observer, pose, direction, range_m)
     focal, retina = observer.camera.focal_px, observer.retina
     frame, middle, baseline = rig_frame(pose)
-    # axes as rows, (B, 9, 3): of the rig and of both eyes, from which all is seen at once
-    axes = torch.cat((frame, pose.R_left, pose.R_right), -1).mT
-    origin = torch.stack((middle, pose.t_left, pose.t_right), 1).repeat_interleave(3, 1)
-    along = axes @ direction.mT
-    place = torch.addcmul(-(axes * origin).sum(-1, keepdim=True), along, range_m[:, None])
-    (ux, uy, uz), (x, y, _) = along[:, :3].unbind(1), place[:, :3].unbind(1)
-    in_front = place[:, 2::3] > 1e-3
-    depths = torch.where(in_front, place[:, 2::3], 1.0)
-    depth = depths[:, :1]
-    # of the left eye and of the right one, (B, 2, N)
-    side = torch.stack((baseline, -baseline), -1)[..., None] / 2
-    shrink = focal / depths[:, 1:]
-    px = columns(place[:, 3::3] * shrink, place[:, 4::3] * shrink)
-    inside = retina.inside(px)
-    u, v = (x[:, None] + side) / depth, (y / depths[:, 0])[:, None]
-    # of the range: by the slopes' mean, by their difference and by v
-    reach = (ux * x + uy * y + uz * depths[:, 0])[:, None]
-    by_u, by_v = depth * (ux[:, None] / 2 - reach / (2 * side)), depth * (uy / 2)[:, None]
-    by_both = by_u * u + by_v * v
-    ax, ay, az = (axes[:, :3] @ axes[:, 3:].mT).unflatten(-1, (2, 3))[..., None].unbind(1)
-    across = ax[:, :, 0] * by_u + ay[:, :, 0] * by_v - az[:, :, 0] * by_both
-    upright = ax[:, :, 1] * by_u + ay[:, :, 1] * by_v - az[:, :, 1] * by_both
-    sigma = eye_sigma_px(observer.budget, retina, px) * (depths[:, 1:] / depth)
-    left, right = (sigma.square() * (across.square() + upright.square())).unbind(1)
-    visible = in_front[:, 0] & in_front[:, 1] & in_front[:, 2] & inside[:, 0] & inside[:, 1]
-    return visible, ((left + right) / (focal * range_m.square()).square()).clamp(min=1e-12)
+    half = baseline[:, None] / 2
+    # vectors as columns, (B, 3, N): seen from the rig, and from the left eye and the right one (B, 2, 3, N)
+    point = direction.mT * range_m[:, None]
+    x, y, z = (frame.mT @ (point - middle[..., None])).unbind(1)
+    ux, uy, uz = (frame.mT @ direction.mT).unbind(1)
+    rotation, centre = torch.stack((pose.R_left, pose.R_right), 1), torch.stack((pose.t_left, pose.t_right), 1)
+    cx, cy, cz = (rotation.mT @ (point[:, None] - centre[..., None])).unbind(2)
+    ahead, forward = z > 1e-3, cz > 1e-3
+    depth, distance = torch.where(ahead, z, 1.0), torch.where(forward, cz, 1.0)
+    px = focal * columns(cx / distance, cy / distance)
+    seen = forward & retina.inside(px)
+    v = y / depth
+    # of the range: by the slopes' mean and by their difference
+    along = ux * x + uy * y + uz * depth
+    by_mean, by_disparity, by_v = depth * ux / 2, depth * along / (2 * half), (depth * uy / 2)[:, None]
+    u = torch.stack((x + half, x - half), 1) / depth[:, None]
+    by_u = torch.stack((by_mean - by_disparity, by_mean + by_disparity), 1)
+    sigma = eye_sigma_px(observer.budget, retina, px) / focal * (distance / depth[:, None])
+    v = v[:, None]
+    ax, ay, az = (frame.mT[:, None] @ rotation)[..., None].unbind(2)
+    across, upright = (
+        (sigma * (by_u * (ax[:, :, k] - u * az[:, :, k]) + by_v * (ay[:, :, k] - v * az[:, :, k]))).square()
+        for k in (0, 1)
+    )
+    spread = across[:, 0] + upright[:, 0] + across[:, 1] + upright[:, 1]
+    return ahead & seen[:, 0] & seen[:, 1], (spread / range_m.square().square()).clamp(min=1e-12)
 
 
 def _glance_by_loops(

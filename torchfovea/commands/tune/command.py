@@ -23,6 +23,7 @@ from torchfovea.commands.shared.unread import refuse_unread
 from torchfovea.commands.tune.files import write_memory, write_scenes
 from torchfovea.commands.tune.judge import build_start, judge_policies, move_start
 from torchfovea.commands.tune.study import check_study, study_curves, study_gradients
+from torchfovea.compiling import compiling
 from torchfovea.deciding.weighted import Weighting
 from torchfovea.files import write_csv
 from torchfovea.setting import require
@@ -83,7 +84,8 @@ def run(cfg: DictConfig) -> float:
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # minibatches are small: more threads would only wait for each other
     try:
-        return _run(cfg)
+        with compiling(str(cfg.compile)):
+            return _run(cfg)
     finally:
         torch.set_num_threads(threads)
 
