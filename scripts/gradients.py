@@ -25,7 +25,6 @@ from torchfovea.setting import require
 from torchfovea.tuning.bias import decode
 from torchfovea.tuning.problem import Problem, evaluate_bias
 from torchfovea.tuning.rivals import best_alpha, fitted_bias, remembered_bias
-from torchfovea.tuning.scenes import stream
 from torchfovea.tuning.study import student
 from torchfovea.tuning.train import Schedule, train
 from torchfovea.untrusted import read_tensors
@@ -63,7 +62,7 @@ def one_seed(cfg: DictConfig, problem: Problem, seed: int, ways: list[str]) -> d
         print(f"  seed {seed}  {name}: {what}", flush=True)
     judge = int(cfg.heldout_seed) + seed
     return {
-        name: evaluate_bias(own, vector, sizes["heldout_scenes"], stream("heldout", judge), strict=False)
+        name: evaluate_bias(own, vector, own.exam("heldout", judge, sizes["heldout_scenes"]), strict=False)
         for name, (own, vector) in found.items()
     }
 

@@ -123,7 +123,7 @@ def test_rivals_gain_much_in_few_episodes(name, monkeypatch):
         monkeypatch.setattr(rivals, "nearest_point", hidden)
     spent, vectors = zip(*rivals.RIVALS[name](p, start, 128, 0), strict=True)
     assert list(spent) == sorted(spent) and spent[-2] < 128 <= spent[-1]
-    before, after = (float(evaluate_bias(p, v, 128, stream("heldout", 1)).mean()) for v in (start, vectors[-2]))
+    before, after = (float(evaluate_bias(p, v, p.exam("heldout", 1, 128)).mean()) for v in (start, vectors[-2]))
     assert after > before + 0.05
     again = dict(rivals.RIVALS[name](p, start, 128, 0))
     assert all(torch.equal(again[k], v) for k, v in zip(spent, vectors, strict=True))
@@ -134,7 +134,7 @@ def test_alpha_is_the_best_on_validation_scenes():
     vector = table_1(p.shape, "target")
     chosen, score = rivals.best_alpha(p, vector, 32, (0.1, 1.0, 2.5))
     scores = [
-        float(evaluate_bias(p, rivals.with_alpha(p.shape, vector, a), 32, stream("validation", 0)).mean())
+        float(evaluate_bias(p, rivals.with_alpha(p.shape, vector, a), p.exam("validation", 0, 32)).mean())
         for a in (0.1, 1.0, 2.5)
     ]
     assert score == max(scores)

@@ -375,7 +375,7 @@ def test_curves_and_hand():
     by_hand, sigma = hand(p, scenes=64, sigmas=(0.05, 0.16, 0.5))
     assert sigma == 0.16
     start = table_1(p.shape, "top")
-    better, worse = (evaluate_bias(p, x, 64, stream("heldout", 0)) for x in (by_hand, start))
+    better, worse = (evaluate_bias(p, x, p.exam("heldout", 0, 64)) for x in (by_hand, start))
     assert float((better - worse).mean()) > 0.1
     schedule, heldout = Schedule(episodes=150, validation_scenes=16), Heldout(16, 1)
     whole = list(curves(p, start, ["coverage+none", "random@16"], 2, schedule, heldout))
@@ -396,8 +396,8 @@ def test_an_incumbent_is_not_credited_before_its_episodes_are_spent(monkeypatch)
     monkeypatch.setitem(SEARCHES, "random", lambda *_: iter([(65, later), (200, start)]))
     (curve,) = curves(p, start, ["random"], 1, Schedule(episodes=256, validation_scenes=64), Heldout(64, 1))
     before, after, _ = (row.heldout for row in curve)
-    assert before == float(evaluate_bias(p, start, 64, stream("heldout", 1)).mean())
-    assert after == float(evaluate_bias(p, later, 64, stream("heldout", 1)).mean()) > before
+    assert before == float(evaluate_bias(p, start, p.exam("heldout", 1, 64)).mean())
+    assert after == float(evaluate_bias(p, later, p.exam("heldout", 1, 64)).mean()) > before
     assert curve[2].heldout == after and curve[2].heldout_last == before
 
 

@@ -63,7 +63,9 @@ def hand(
             if shape.conditioned
             else _plain_hand(shape, distribution, sigma, alpha)
         )
-        scored.append((float(evaluate_bias(problem, vector, scenes, stream("validation", 0)).mean()), sigma, vector))
+        scored.append(
+            (float(evaluate_bias(problem, vector, problem.exam("validation", 0, scenes)).mean()), sigma, vector)
+        )
     _, sigma, vector = max(scored, key=lambda item: item[0])
     return best_alpha(problem, vector, scenes)[0], sigma
 

@@ -68,13 +68,15 @@ def fit_by_gradient(scenes: Scenes, direction: Tensor, far_m: float = 6.0, steps
     """Maximum likelihood of independent Gaussians, with Adam, in the interpolating kernel's own coefficients."""
     rho = _samples(scenes, direction, far_m)
     weight = (_SHARPNESS * (direction @ direction.mT - 1)).softmax(-1)
-    mean = rho.mean(0).clone().requires_grad_()
-    log_std = rho.std(0).clamp(min=_SMALLEST_STD).log().clone().requires_grad_()
+    # all that a likelihood of Gaussians knows of its samples
+    centre, variance = rho.mean(0), rho.var(0, unbiased=False)
+    mean = centre.clone().requires_grad_()
+    log_std = rho.std(0).clamp(min=_SMALLEST_STD).log().requires_grad_()
     optimizer = torch.optim.Adam([mean, log_std], lr=0.02)
     for _ in range(steps):
         optimizer.zero_grad()
         mu, sigma = weight @ mean, (weight @ log_std).exp().clamp(min=_SMALLEST_STD)
-        loss = (0.5 * ((rho - mu) / sigma).square() + sigma.log()).mean()
+        loss = (0.5 * (variance + (centre - mu).square()) / sigma.square() + sigma.log()).mean()
         loss.backward()
         optimizer.step()
     with torch.no_grad():

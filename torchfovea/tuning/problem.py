@@ -19,13 +19,14 @@ from torchfovea.setting import SettingError, require
 from torchfovea.tuning.bias import Bias, Shape, decode, fov_of
 from torchfovea.tuning.cells import draw_cells, reachable
 from torchfovea.tuning.prior_field import PriorField, look_up
-from torchfovea.tuning.scenes import Distribution, Scenes, draw_scenes
+from torchfovea.tuning.scenes import Distribution, Scenes, draw_scenes, stream
 from torchfovea.tuning.simulator import Run, simulate
 from torchfovea.tuning.worlds import Task, Worlds, check_observer, world_of
 
-__all__ = ["Batch", "Problem", "evaluate_bias", "play", "play_each", "prepare"]
+__all__ = ["Batch", "Problem", "evaluate_bias", "evaluate_policies", "play", "play_each", "prepare"]
 
 _QUADRATURE = 12000  # directions on the whole sphere
+_AT_ONCE = 256  # episodes of an exam
 
 
 class Batch(NamedTuple):
@@ -68,6 +69,7 @@ class Problem:
         check_observer(task.observer)
         self.task, self.distribution, self.shape, self.cells, self.dtype = task, distribution, shape, cells, dtype
         self.field = field
+        self._exams: dict[tuple[str, int, int], list[Batch]] = {}
 
     @cached_property
     def quadrature(self) -> Quadrature:
@@ -79,6 +81,21 @@ class Problem:
         drawn = draw_scenes(self.distribution, self.task.observer.head, scenes, generator, self.dtype)
         noise = torch.randn(self.task.saccades, scenes, self.cells, generator=generator, dtype=self.dtype)
         return Batch(drawn, noise, int(torch.randint(2**62, (), generator=generator)))
+
+    def exam(self, split: str, seed: int, scenes: int) -> list[Batch]:
+        """The episodes of a stream on which vectors are compared, drawn once.
+
+        Args:
+            split: see `torchfovea.tuning.scenes.stream`.
+            seed: likewise.
+            scenes: how many.
+        """
+        key = split, seed, scenes
+        if key not in self._exams:
+            generator = stream(split, seed)
+            sizes = [min(_AT_ONCE, scenes - begin) for begin in range(0, scenes, _AT_ONCE)]
+            self._exams[key] = [self.batch(size, generator) for size in sizes]
+        return self._exams[key]
 
     def bias(self, vector: Tensor, scenes: Scenes) -> Bias:
         """The vector's mixtures for some scenes. Differentiable in the vector."""
@@ -142,12 +159,18 @@ def _value(problem: Problem, vector: Tensor, batch: Batch) -> float:
     return -1.0
 
 
-def evaluate_bias(
-    problem: Problem, vector: Tensor, scenes: int, generator: torch.Generator, at_once: int = 256, strict: bool = True
+def evaluate_bias(problem: Problem, vector: Tensor, exam: Sequence[Batch], strict: bool = True) -> Tensor:
+    """The metric in the episodes of an exam (`Problem.exam`), (scenes,), with the hard policy. See `prepare`."""
+    return evaluate_policies(problem, [vector], exam, strict)[0]
+
+
+def evaluate_policies(
+    problem: Problem, vectors: Sequence[Tensor], exam: Sequence[Batch], strict: bool = True
 ) -> Tensor:
-    """The metric in fresh episodes, (scenes,), with the hard policy. See `prepare`."""
-    parts = []
-    for begin in range(0, scenes, at_once):
-        batch = problem.batch(min(at_once, scenes - begin), generator)
-        parts.append(play(problem, vector, batch, strict).value)
-    return torch.cat(parts)
+    """As `evaluate_bias` of vectors with the same bias, whose weights of the acquisition alone differ: (K, scenes)."""
+    problem, parts = problem.at(vectors[0]), []
+    for batch in exam:
+        each = [problem.bias(vector.detach(), batch.scenes) for vector in vectors]
+        world = prepare(problem, each[0], batch, strict)
+        parts.append(torch.stack([simulate(problem.task, batch.scenes, world, bias.weights).value for bias in each]))
+    return torch.cat(parts, 1)

@@ -18,7 +18,7 @@ from torchfovea.memory.sphere import DirectionMixture
 from torchfovea.sensing.head import cyclopean
 from torchfovea.setting import SettingError, require
 from torchfovea.tuning.bias import Shape, encode, features, numbers_of, with_weights
-from torchfovea.tuning.problem import Problem, evaluate_bias, play, play_each
+from torchfovea.tuning.problem import Problem, evaluate_policies, play, play_each
 from torchfovea.tuning.scenes import Scenes, nearest_point, stream
 from torchfovea.tuning.simulator import Run
 
@@ -148,7 +148,7 @@ def best_alpha(problem: Problem, vector: Tensor, scenes: int, alphas: Sequence[f
     if not problem.shape.tune_alpha:
         alphas = (problem.shape.alpha,)
     tried = [with_alpha(problem.shape, vector, alpha) for alpha in alphas]
-    scores = [float(evaluate_bias(problem, v, scenes, stream("validation", 0), strict=False).mean()) for v in tried]
+    scores = evaluate_policies(problem, tried, problem.exam("validation", 0, scenes), strict=False).mean(1).tolist()
     best = scores.index(max(scores))
     return tried[best], scores[best]
 

@@ -16,7 +16,6 @@ from torchfovea.setting import SettingError, require
 from torchfovea.tuning.baselines import SEARCHES
 from torchfovea.tuning.problem import Problem, evaluate_bias
 from torchfovea.tuning.rivals import RIVALS
-from torchfovea.tuning.scenes import stream
 from torchfovea.tuning.train import ESTIMATORS, Schedule, train
 
 __all__ = [
@@ -134,7 +133,7 @@ def curves(
         key = (vector.numpy().tobytes(), split)
         if key not in scored:
             scenes, seed = (schedule.validation_scenes, 0) if split == "validation" else heldout
-            scored[key] = float(evaluate_bias(problem, vector, scenes, stream(split, seed), strict=False).mean())
+            scored[key] = float(evaluate_bias(problem, vector, problem.exam(split, seed, scenes), strict=False).mean())
         return scored[key]
 
     budgets = budgets_up_to(schedule.episodes)

@@ -196,7 +196,8 @@ def _step(problem: Problem, schedule: Schedule, state: State) -> tuple[State, fl
 
 
 def _validate(problem: Problem, schedule: Schedule, state: State) -> None:
-    value = float(evaluate_bias(problem, state.vector, schedule.validation_scenes, stream("validation", 0)).mean())
+    exam = problem.exam("validation", 0, schedule.validation_scenes)
+    value = float(evaluate_bias(problem, state.vector, exam).mean())
     state.history.append((state.episodes, value, state.vector.tolist()))
     if value > state.best_value:
         state.best, state.best_value = state.vector.clone(), value

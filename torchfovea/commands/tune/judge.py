@@ -19,7 +19,7 @@ from torchfovea.tuning.baselines import TABLE_1, hand, table_1
 from torchfovea.tuning.bias import Shape, encode
 from torchfovea.tuning.cells import reachable
 from torchfovea.tuning.prior_field import fit_by_gradient, fit_closed_form
-from torchfovea.tuning.problem import Problem, evaluate_bias
+from torchfovea.tuning.problem import Problem, evaluate_bias, evaluate_policies
 from torchfovea.tuning.rivals import fitted_bias, remembered_bias
 from torchfovea.tuning.scenes import draw_scenes, stream
 from torchfovea.tuning.study import Heldout
@@ -92,9 +92,8 @@ def judge_policies(
             field = fit(scenes_seen, grid, problem.task.far_m)
             informed = Problem(problem.task, problem.distribution, problem.shape, problem.cells, problem.dtype, field)
             tried = [table_1(problem.shape, "unbiased", a) for a in _FIELD_ALPHAS]
-            scores = [
-                float(evaluate_bias(informed, v, min(checked, 256), stream("validation", 0)).mean()) for v in tried
-            ]
+            exam = informed.exam("validation", 0, min(checked, 256))
+            scores = evaluate_policies(informed, tried, exam).mean(1).tolist()
             policies[name] = (tried[scores.index(max(scores))], informed)
             if name == "prior_field":
                 policies["tuned_with_prior_field"] = (state.best, informed)
@@ -109,7 +108,7 @@ def judge_policies(
         return float(interval.estimate)
 
     for name, (vector, judged) in policies.items():
-        values[name] = evaluate_bias(judged, vector, heldout.scenes, stream("heldout", heldout.seed))
+        values[name] = evaluate_bias(judged, vector, problem.exam("heldout", heldout.seed, heldout.scenes))
         note(name, values[name])
     best = max(TABLE_1, key=lambda name: float(values[name].mean()))
     for other in (best, "hand", "fitted", "remembered", *(["prior_field"] if cfg.prior_field else [])):
