@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.memory.sphere import direction_mixture
+from torchfovea.tuning.adam import adam, at_rest
 from torchfovea.tuning.bias import Shape, encode, features, fix_vector
 from torchfovea.tuning.problem import Problem, evaluate_bias, play_each
 from torchfovea.tuning.rivals import best_alpha
@@ -177,7 +178,7 @@ def finite_differences(
     """Adam on central differences with common random numbers, one number after the other."""
     vector = fix_vector(problem.shape, start)
     objective, spent, key = _objective(problem, seed, per_evaluation), 0, 0
-    first, second = torch.zeros_like(vector), torch.zeros_like(vector)
+    moments = at_rest(vector)
     cost, h = 2 * per_evaluation * len(vector), 0.2
     offsets = h * torch.eye(len(vector), dtype=torch.float64)
     while spent < episodes:
@@ -185,10 +186,8 @@ def finite_differences(
         ahead, behind = torch.tensor(sides, dtype=torch.float64).chunk(2)
         slope = (ahead - behind) / (2 * h)
         spent, key = spent + cost, key + 1
-        first, second = 0.9 * first + 0.1 * slope, 0.98 * second + 0.02 * slope.square()
-        rate = 0.1 - 0.08 * min(spent / episodes, 1)
-        step = (first / (1 - 0.9**key)) / ((second / (1 - 0.98**key)).sqrt() + 1e-8)
-        vector = fix_vector(problem.shape, vector + rate * step)
+        moments, move = adam(moments, slope, 0.1 - 0.08 * min(spent / episodes, 1))
+        vector = fix_vector(problem.shape, vector + move)
         yield spent, vector
 
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchfovea.setting import require
+from torchfovea.tuning.adam import adam, at_rest
 from torchfovea.tuning.scenes import Scenes, first_surfaces
 
 __all__ = ["PriorField", "fit_by_gradient", "fit_closed_form", "look_up"]
@@ -70,16 +71,17 @@ def fit_by_gradient(scenes: Scenes, direction: Tensor, far_m: float = 6.0, steps
     weight = (_SHARPNESS * (direction @ direction.mT - 1)).softmax(-1)
     # all that a likelihood of Gaussians knows of its samples
     centre, variance = rho.mean(0), rho.var(0, unbiased=False)
-    mean = centre.clone().requires_grad_()
-    log_std = rho.std(0).clamp(min=_SMALLEST_STD).log().requires_grad_()
-    optimizer = torch.optim.Adam([mean, log_std], lr=0.02)
+    own = torch.stack((centre, rho.std(0).clamp(min=_SMALLEST_STD).log()), -1)  # means and logarithms
+    moments = at_rest(own)
+
+    def beliefs(own: Tensor) -> tuple[Tensor, Tensor]:
+        mean, log_std = (weight @ own).unbind(-1)
+        return mean, log_std.exp().clamp(min=_SMALLEST_STD)
+
     for _ in range(steps):
-        optimizer.zero_grad()
-        mu, sigma = weight @ mean, (weight @ log_std).exp().clamp(min=_SMALLEST_STD)
+        own.requires_grad_()
+        mu, sigma = beliefs(own)
         loss = (0.5 * (variance + (centre - mu).square()) / sigma.square() + sigma.log()).mean()
-        loss.backward()
-        optimizer.step()
-    with torch.no_grad():
-        return PriorField(
-            direction, (weight @ mean).detach(), (weight @ log_std).exp().clamp(min=_SMALLEST_STD).detach()
-        )
+        moments, move = adam(moments, torch.autograd.grad(loss, own)[0], 0.02, (0.9, 0.999))
+        own = own.detach() - move
+    return PriorField(direction, *beliefs(own))

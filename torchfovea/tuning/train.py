@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchfovea.files import write_tensors
 from torchfovea.setting import SettingError, check_types, require
+from torchfovea.tuning.adam import Moments, adam
 from torchfovea.tuning.bias import fix_vector
 from torchfovea.tuning.estimators import Gradient, counterfactual, coverage, covered, fov_difference, policy
 from torchfovea.tuning.myopic import myopic
@@ -176,13 +177,9 @@ def _step(problem: Problem, schedule: Schedule, state: State) -> tuple[State, fl
             f"gradient = not finite at step {state.step}: expected finite numbers; stopped at the last checkpoint, "
             f"{state.best_value:.4f} on validation"
         )
-    step = state.step + 1
-    beta, gamma = 0.9, 0.98
-    first = beta * state.first + (1 - beta) * found.vector
-    second = gamma * state.second + (1 - gamma) * found.vector.square()
     share = min(state.episodes / schedule.episodes, 1.0)
     rate = schedule.rate + (schedule.last_rate - schedule.rate) * share
-    move = rate * (first / (1 - beta**step)) / ((second / (1 - gamma**step)).sqrt() + 1e-8)
+    (first, second, step), move = adam(Moments(state.first, state.second, state.step), found.vector, rate)
     # one scale for all numbers of a mixture would be the natural step; Adam's own keeps the small ones moving
     vector = fix_vector(problem.shape, state.vector + move)
     if not bool(torch.isfinite(vector).all()):
