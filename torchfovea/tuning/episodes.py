@@ -67,7 +67,7 @@ def play_by_loops(
     chosen, scores = torch.full((n, steps), -1), torch.full((n, steps), -math.inf, dtype=angles.dtype)
     kept = (steps - 1, n, cells) if keep else (0,)
     before = Known(angles.new_empty(kept), angles.new_empty(kept), torch.empty(kept, dtype=torch.bool))
-    rows = [torch.as_tensor(getattr(weights, name)).to(angles).expand(n) for name in _COVERED]
+    rows = [torch.as_tensor(getattr(weights, name), dtype=angles.dtype).expand(n) for name in _COVERED]
     field = (columns_of(world.direction), *(f.contiguous() for f in (world.range_m, world.noise, world.allowed)))
     start = (*(f.contiguous() for f in memory), made, torch.stack(rows))
     pan, up, down, vergence = map(

@@ -287,10 +287,10 @@ def first_surfaces(scenes: Scenes, origin: Tensor, direction: Tensor) -> Hits:
     if library is not None:
         given = (*scenes.x.shape, *(part.contiguous() for part in scenes[:5]), *map(float, scenes.walls))
         kinds = (direction.dtype, torch.bool, torch.int64)
-        hits = Hits(*(torch.empty(direction.shape[:-1], dtype=kind) for kind in kinds))
+        found = Hits(*(torch.empty(direction.shape[:-1], dtype=kind) for kind in kinds))
         rays = (direction.shape[1], columns_of(direction), origin.shape[1], columns_of(origin))
-        library("first_surfaces", given, rays, tuple(hits))
-        return hits
+        library("first_surfaces", given, rays, tuple(found))
+        return found
     front, back, side, floor, ceiling = scenes.walls
     ox, oy, oz = origin.unbind(-1)
     dx, dy, dz = direction.unbind(-1)

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
-from torchfovea.commands.bench.timing import Path, Peer, compiled_peer, same
+from torchfovea.commands.bench.timing import Path, Peer, compiled_peer, in_mode, same
 from torchfovea.commands.shared.build import build_arena, build_cells, build_scene_of
 from torchfovea.commands.shared.rollout import roll_out
 from torchfovea.commands.shared.settings import changed, number, whole
@@ -179,7 +179,10 @@ def tuning_episode(cfg: DictConfig, observer: Observer) -> Path:
         f"an episode of {task.saccades} saccades and {cells} cells; {episodes} together",
         "cpu",
         together,
-        (Peer(f"one by one, {len(part)} of them scaled", alone, episodes / len(part)),),
+        (
+            Peer(f"one by one, {len(part)} of them scaled", alone, episodes / len(part)),
+            *compiled_peer(cfg.compile, lambda mode: partial(in_mode, mode, together)),
+        ),
         check,
         units=episodes,
     )
