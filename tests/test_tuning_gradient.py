@@ -28,12 +28,11 @@ from torchfovea.tuning.bias import (
     encode,
     fix_vector,
     fov_of,
-    log_density_each,
-    log_normalizer_each,
     mixture_of,
 )
 from torchfovea.tuning.cells import draw_cells, reachable
 from torchfovea.tuning.check import Sample, agreement, estimate_gradient, finite_differences, slope_along
+from torchfovea.tuning.density import log_density_each, log_normalizer_each
 from torchfovea.tuning.estimators import counterfactual, policy_difference
 from torchfovea.tuning.pathwise import panorama
 from torchfovea.tuning.prior_field import fit_by_gradient, fit_closed_form, look_up

@@ -16,6 +16,7 @@ from torchfovea.sensing.head import Gaze, eyes
 from torchfovea.sensing.layout import LogPolar, Uniform
 from torchfovea.tuning.bias import Bias
 from torchfovea.tuning.cells import draw_cells
+from torchfovea.tuning.density import log_density_each
 from torchfovea.tuning.episodes import episode_loops
 from torchfovea.tuning.scenes import Distribution, draw_scenes, first_surfaces, stream
 from torchfovea.tuning.simulator import Resumed, simulate
@@ -123,3 +124,28 @@ def test_what_no_loop_knows_is_played_as_written():
     with compiling("on"):
         known = look(task, world._replace(direction=direction), Known(*world[-2:], world.allowed), eyes(HEAD, gaze), 0)
     assert known.precision.requires_grad
+
+
+@pytest.mark.parametrize("dtype", CLOSE)
+@pytest.mark.parametrize(("mixtures", "components", "rows"), [(1, 1, 1), (1, 3, 4), (4, 2, 4), (3, 1, 3)])
+def test_densities_and_their_slopes_are_those_of_the_definition(mixtures, components, rows, dtype):
+    """Directions everywhere, so that most are deep in a tail; the same for all, or each mixture its own."""
+    generator = torch.Generator().manual_seed(mixtures + components)
+    draw = torch.randn(mixtures, components, 13, generator=generator, dtype=torch.float64).to(dtype)
+    lower, diagonal = torch.tril(draw[..., 4:].unflatten(-1, (3, 3)), -1), torch.eye(3, dtype=dtype)
+    numbers = [draw[..., 0], draw[..., 1:4], 0.2 * lower + 0.3 * diagonal]
+    way = torch.nn.functional.normalize(torch.randn(rows, 50, 3, generator=generator, dtype=torch.float64), dim=-1)
+    way, weigh = way.to(dtype), torch.randn(rows, 50, generator=generator, dtype=torch.float64).to(dtype)
+    way = way[:1].expand(rows, -1, -1) if components == 1 else way
+
+    def ascent():
+        given = [part.clone().requires_grad_() for part in numbers]
+        value = log_density_each(Bias(*given, Weighting()), way)
+        return value.detach(), *torch.autograd.grad((weigh * value).sum(), given)
+
+    written, quick = both(ascent)
+    same(written, quick, dtype)
+    if dtype == torch.float64:
+        with compiling("on"):
+            given = [part.clone().requires_grad_() for part in numbers]
+            assert torch.autograd.gradcheck(lambda *x: log_density_each(Bias(*x, Weighting()), way), given)

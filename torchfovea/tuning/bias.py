@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from torchfovea.deciding.weighted import Weighting
-from torchfovea.memory.sphere import DirectionMixture, Quadrature, deep_tail, fix_gauge, log_radial_moment
+from torchfovea.memory.sphere import DirectionMixture, fix_gauge
 from torchfovea.setting import check_types, require
 
 __all__ = [
-    "Bias", "Shape", "decode", "encode", "features", "fix_vector", "fov_of", "log_density_each",
-    "log_normalizer_each", "mixture_of", "nudged", "numbers_of", "with_weights",
+    "Bias", "Shape", "decode", "encode", "features", "fix_vector", "fov_of", "mixture_of", "nudged", "numbers_of",
+    "with_weights",
 ]  # fmt: skip
 
 _LOG_DIAGONAL = (-3.0, 1.0)
@@ -243,34 +243,3 @@ def mixture_of(shape: Shape, vector: Tensor, task: Tensor | None = None) -> Dire
         shape, vector, torch.zeros(1, shape.task_numbers).to(vector) if task is None else task[None].to(vector)
     )
     return fix_gauge(DirectionMixture(bias.logits[0], bias.means[0], bias.cholesky[0]))
-
-
-def log_density_each(bias: Bias, directions: Tensor) -> Tensor:
-    """`torchfovea.memory.sphere.log_density` of a batch of mixtures, each at its own directions.
-
-    Args:
-        bias: B mixtures (or one for all).
-        directions: unit (B, K, 3).
-
-    Returns:
-        (B, K), per steradian. Differentiable in the mixtures.
-    """
-    u = directions.unsqueeze(-2)
-    eye = torch.eye(3, dtype=u.dtype, device=u.device)
-    whitening = torch.linalg.solve_triangular(bias.cholesky, eye.expand_as(bias.cholesky), upper=False)
-    w = torch.einsum("bmij,bkj->bkmi", whitening.expand(len(directions), -1, -1, -1), directions)
-    y = (whitening @ bias.means[..., None])[..., 0][:, None]
-    length = w.square().sum(-1).sqrt()
-    w = w / length[..., None]
-    d = (w * y).sum(-1)
-    off_axis = torch.linalg.cross(w, y.expand_as(w)).square().sum(-1)
-    radial = log_radial_moment(d) - 0.5 * torch.where(d > -deep_tail(d.dtype)[0], off_axis, y.square().sum(-1))
-    log_det = bias.cholesky.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    weight = (bias.logits.log_softmax(-1) - math.log(2 * math.pi) - log_det)[:, None]
-    return torch.logsumexp(weight - 3 * length.log() + radial, -1)
-
-
-def log_normalizer_each(bias: Bias, quadrature: Quadrature) -> Tensor:
-    """Log probability of the reachable set under each mixture, (B,). Differentiable."""
-    directions = quadrature.directions.to(bias.means).expand(len(bias.means), -1, -1)
-    return torch.logsumexp(log_density_each(bias, directions) + quadrature.solid_angle_sr.to(bias.means).log(), -1)

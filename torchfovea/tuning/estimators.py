@@ -26,7 +26,8 @@ from torch import Tensor
 
 from torchfovea.sensing.head import Gaze
 from torchfovea.setting import require
-from torchfovea.tuning.bias import Bias, log_density_each, log_normalizer_each, nudged
+from torchfovea.tuning.bias import Bias, nudged
+from torchfovea.tuning.density import log_density_each, log_normalizer_each
 from torchfovea.tuning.problem import Batch, Problem, play, prepare
 from torchfovea.tuning.scenes import Scenes, first_surfaces, nearest_point
 from torchfovea.tuning.simulator import Resumed, blank, simulate

@@ -11,8 +11,8 @@ from torchfovea.deciding.weighted import Weighting
 from torchfovea.metrics import gap
 from torchfovea.sensing.head import Gaze, eyes, fixate
 from torchfovea.setting import require
-from torchfovea.tuning.bias import log_density_each, log_normalizer_each
 from torchfovea.tuning.cells import draw_cells
+from torchfovea.tuning.density import log_density_each, log_normalizer_each
 from torchfovea.tuning.estimators import Credit, Gradient, finish
 from torchfovea.tuning.problem import Batch, Problem, prepare
 from torchfovea.tuning.simulator import score, simulate

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from torchfovea.commands.shared.pictures import PALETTE
 from torchfovea.files import write_figure
-from torchfovea.tuning.bias import log_density_each, log_normalizer_each
 from torchfovea.tuning.cells import reachable
+from torchfovea.tuning.density import log_density_each, log_normalizer_each
 from torchfovea.tuning.problem import Problem
 from torchfovea.tuning.scenes import Scenes, draw_scenes, stream
 from torchfovea.tuning.study import Row, mean_curves, reads_scenes, student
