@@ -67,7 +67,7 @@ int64_t density(const Mixtures *of, const Directions *at, REAL *value, const REA
         for (int64_t i = 0; i < at->count; i++) {
             const REAL *u = at->direction + 3 * (row * at->apart + i);
             REAL most = -INFINITY, sum = 0;
-            for (int64_t m = first; m < first + k; m++) {
+            for (int64_t m = first; m < first + k && !(given && k == 1); m++) {
                 const REAL one = part(of, m, u).value;
                 if (one > most) sum = sum * exp(most - one) + 1, most = one;
                 else sum += exp(one - most);
@@ -79,7 +79,7 @@ int64_t density(const Mixtures *of, const Directions *at, REAL *value, const REA
             }
             for (int64_t m = first; m < first + k; m++) {
                 const Part p = part(of, m, u);
-                const double share = (double)given[row * at->count + i] * exp(p.value - all);
+                const double share = given[row * at->count + i] * (k == 1 ? 1 : exp(p.value - all));
                 const REAL *y = of->mean + 3 * m;
                 to->weight[m] += share;
                 for (int j = 0; j < 3; j++) {

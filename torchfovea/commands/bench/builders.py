@@ -10,7 +10,14 @@ from functools import cache
 import torch
 from omegaconf import DictConfig
 
-from torchfovea.commands.bench.episodes import episode, photometric_saccade, picture, sweeps, tuning_episode
+from torchfovea.commands.bench.episodes import (
+    episode,
+    photometric_saccade,
+    picture,
+    sweeps,
+    tuning_episode,
+    tuning_gradient,
+)
 from torchfovea.commands.bench.look import Saccade, saccade
 from torchfovea.commands.bench.paths import paths_of_look
 from torchfovea.commands.bench.retina_paths import path_of_retina
@@ -76,7 +83,7 @@ def builders_of(cfg: DictConfig, device: str, wanted: Sequence[str]) -> list[Cal
         builders += [
             (("render",), lambda: [picture(cfg, full, source)]),
             (("saccade",), lambda: [photometric_saccade(cfg, full)]),
-            (("tune",), lambda: [tuning_episode(cfg, full)]),
+            (("tune",), lambda: [tuning_episode(cfg, full), tuning_gradient(cfg, full)]),
         ]
         if cfg.matcher.name == "sweep":  # others match pair by pair
             builders.append(

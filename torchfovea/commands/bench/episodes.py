@@ -23,11 +23,15 @@ from torchfovea.sensing.camera import image_camera
 from torchfovea.sensing.head import Gaze, eyes
 from torchfovea.sim import gl, rays
 from torchfovea.stereo.matchers import match_all
-from torchfovea.tuning.scenes import Distribution, draw_scenes
+from torchfovea.tuning.baselines import table_1
+from torchfovea.tuning.bias import Shape
+from torchfovea.tuning.estimators import Gradient, covered
+from torchfovea.tuning.problem import Problem, play
+from torchfovea.tuning.scenes import Distribution, draw_scenes, stream
 from torchfovea.tuning.simulator import simulate
 from torchfovea.tuning.worlds import Task, Worlds, world_of
 
-__all__ = ["episode", "photometric_saccade", "picture", "sweeps", "tuning_episode"]
+__all__ = ["episode", "photometric_saccade", "picture", "sweeps", "tuning_episode", "tuning_gradient"]
 
 
 def picture(cfg: DictConfig, observer: Observer, size: int) -> Path:
@@ -185,4 +189,29 @@ def tuning_episode(cfg: DictConfig, observer: Observer) -> Path:
         ),
         check,
         units=episodes,
+    )
+
+
+def tuning_gradient(cfg: DictConfig, observer: Observer) -> Path:
+    """Tuning's gradient of a bias, with all episodes that it plays, a scene of the minibatch."""
+    scenes, cells = whole(cfg, "tuning.episodes", 8), whole(cfg, "tuning.cells", 2)
+    task = Task(observer, whole(cfg, "saccades", 2), number(cfg, "far_m"))
+    problem = Problem(task, Distribution(), Shape(), cells)
+    batch, vector = problem.batch(scenes, stream("training", int(cfg.seed))), table_1(problem.shape, "target")
+
+    def ours() -> Gradient:
+        with torch.enable_grad():
+            return covered(problem, vector, batch)
+
+    def check() -> None:
+        same("tune", [ours().value], [float(play(problem, vector, batch).value.mean())], 1e-6)
+
+    return Path(
+        "tune",
+        f"a gradient's episodes, {task.saccades} saccades and {cells} cells, for each of {scenes} scenes",
+        "cpu",
+        ours,
+        compiled_peer(cfg.compile, lambda mode: partial(in_mode, mode, ours)),
+        check,
+        units=scenes,
     )
