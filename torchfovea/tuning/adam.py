@@ -7,10 +7,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["Moments", "adam", "at_rest"]
+__all__ = ["Averages", "adam", "at_rest"]
 
 
-class Moments(NamedTuple):
+class Averages(NamedTuple):
     """Running means of gradients and of their squares, after so many steps."""
 
     first: Tensor
@@ -18,14 +18,14 @@ class Moments(NamedTuple):
     step: int = 0
 
 
-def at_rest(like: Tensor) -> Moments:
+def at_rest(like: Tensor) -> Averages:
     """Before the first step of what has a vector's shape."""
-    return Moments(torch.zeros_like(like), torch.zeros_like(like))
+    return Averages(torch.zeros_like(like), torch.zeros_like(like))
 
 
 def adam(
-    moments: Moments, gradient: Tensor, rate: float, memory: tuple[float, float] = (0.9, 0.98)
-) -> tuple[Moments, Tensor]:
+    moments: Averages, gradient: Tensor, rate: float, memory: tuple[float, float] = (0.9, 0.98)
+) -> tuple[Averages, Tensor]:
     """The moments after a gradient, and the step along it.
 
     Args:
@@ -38,4 +38,4 @@ def adam(
     first = beta * moments.first + (1 - beta) * gradient
     second = gamma * moments.second + (1 - gamma) * gradient.square()
     move = rate * (first / (1 - beta**step)) / ((second / (1 - gamma**step)).sqrt() + 1e-8)
-    return Moments(first, second, step), move
+    return Averages(first, second, step), move

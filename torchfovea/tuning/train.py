@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchfovea.files import write_tensors
 from torchfovea.setting import SettingError, check_types, require
-from torchfovea.tuning.adam import Moments, adam
+from torchfovea.tuning.adam import Averages, adam
 from torchfovea.tuning.bias import fix_vector
 from torchfovea.tuning.estimators import Gradient, counterfactual, coverage, covered, fov_difference, policy
 from torchfovea.tuning.myopic import myopic
@@ -179,7 +179,7 @@ def _step(problem: Problem, schedule: Schedule, state: State) -> tuple[State, fl
         )
     share = min(state.episodes / schedule.episodes, 1.0)
     rate = schedule.rate + (schedule.last_rate - schedule.rate) * share
-    (first, second, step), move = adam(Moments(state.first, state.second, state.step), found.vector, rate)
+    (first, second, step), move = adam(Averages(state.first, state.second, state.step), found.vector, rate)
     # one scale for all numbers of a mixture would be the natural step; Adam's own keeps the small ones moving
     vector = fix_vector(problem.shape, state.vector + move)
     if not bool(torch.isfinite(vector).all()):
