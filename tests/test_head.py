@@ -147,6 +147,7 @@ def test_clamp():
     ("setting", "value"),
     [
         ("baseline_m", 0.0),
+        ("baseline_m", 204.0),
         ("pan_limit_deg", 190.0),
         ("tilt_down_deg", 90.0),
         ("vergence_max_deg", -1.0),

@@ -5,6 +5,7 @@ import inspect
 import math
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
@@ -21,11 +22,12 @@ from torchfovea.deciding.worth import worth_of_cells
 from torchfovea.gaussian import Information
 from torchfovea.memory.egosphere import Fusion, Prior
 from torchfovea.memory.sphere import fibonacci_directions
-from torchfovea.perception import Eligibility, Observer, decide, gaze_at, new_memory
+from torchfovea.perception import Eligibility, Observer, decide, gaze_at, new_memory, perceive
 from torchfovea.sensing.camera import Pinhole
-from torchfovea.sensing.correspondence import Budget
-from torchfovea.sensing.head import Gaze, Head, gaze_point
+from torchfovea.sensing.correspondence import Budget, Correspondences
+from torchfovea.sensing.head import Gaze, Head, eyes, gaze_point
 from torchfovea.sensing.layout import LogPolar
+from torchfovea.sensing.retina import fovea
 from torchfovea.setting import SettingError
 from torchfovea.sim.cans import Cans
 from torchfovea.sim.room import Room
@@ -273,3 +275,23 @@ def test_a_strategy_is_no_part_of_an_observer():
     with pytest.raises(SettingError, match=expected):
         Observer(acquisition=strategies.raster)
     assert dataclasses.replace(Observer(), reward="range").reward == "range"
+
+
+def test_arrays_and_numbers_in_place_of_tensors_are_named():
+    observer = Observer(retina=LogPolar(600))
+    memory, px = new_memory(observer, fibonacci_directions(20)), observer.retina.centers_px()
+    matches = Correspondences(px, px, px[:, 0].abs() + 1, px[:, 0].abs() + 1, px[:, 0] > 0)
+    gaze, image = Gaze(*torch.zeros(3)), torch.zeros(1, 3, 32, 32)
+    for call, line in (
+        (lambda: fovea(np.zeros((1, 3, 32, 32)), None, observer.retina), "image = ndarray: expected a tensor"),
+        (lambda: fovea(image, [16.0, 16.0], observer.retina), "gaze_px = list: expected a tensor"),
+        (lambda: new_memory(observer, np.eye(3)), "cells = ndarray: expected a tensor"),
+        (lambda: eyes(observer.head, Gaze(0.0, 0.0, 0.0)), "gaze = float: expected a Gaze of tensors"),
+        (lambda: perceive(observer, memory, matches, gaze), "eyes = Gaze: expected a torchfovea.Eyes"),
+        (
+            lambda: perceive(observer, memory, px, eyes(observer.head, gaze)),
+            "matches = Tensor: expected a torch",
+        ),
+    ):
+        with pytest.raises(SettingError, match=f"^{line}"):
+            call()

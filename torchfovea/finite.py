@@ -1,13 +1,13 @@
-"""Checks of tensors' values, where looking at them costs nothing."""
+"""Checks of tensors: that they are some, and of their values where looking at them costs nothing."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from torchfovea.setting import require
+from torchfovea.setting import SettingError, require
 
-__all__ = ["require_finite"]
+__all__ = ["require_finite", "require_tensor"]
 
 
 def require_finite(values: Tensor, setting: str, expected: str) -> None:
@@ -30,3 +30,13 @@ def require_finite(values: Tensor, setting: str, expected: str) -> None:
     # a sum is many times faster than isfinite; that of large numbers may overflow
     finite = bool(values.sum().isfinite()) or bool(values.isfinite().all())
     require(finite, setting, "NaN or infinite values", expected)
+
+
+def require_tensor(value: object, setting: str, expected: str) -> None:
+    """Check that an input is a tensor, not an array, a list or a number.
+
+    Raises:
+        SettingError: for anything else; it names the type.
+    """
+    if not isinstance(value, Tensor):
+        raise SettingError(f"{setting} = {type(value).__name__}: expected {expected}")

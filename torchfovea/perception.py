@@ -184,6 +184,8 @@ def observed(observer: Observer, matches: Correspondences, eyes: Eyes) -> Observ
 
     Differentiable, see `torchfovea.sensing.triangulation.observe`.
     """
+    for name, given, kind in (("matches", matches, Correspondences), ("eyes", eyes, Eyes)):
+        require(isinstance(given, kind), name, type(given).__name__, f"a torchfovea.{kind.__name__}")
     support = matches.supported(observer.retina)
     chart = observer.fusion.chart
     return observe(matches, eyes, observer.cameras, support, observer.points, chart, observer.rotated)

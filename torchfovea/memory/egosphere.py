@@ -18,6 +18,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchfovea.finite import require_tensor
 from torchfovea.gaussian import Gaussian, Information, columns, gaussian_from_information
 from torchfovea.memory.nearest import CellIndex, build_index, neighbour_spacing_rad
 from torchfovea.memory.pooling import nearness
@@ -183,6 +184,7 @@ def empty_memory(cells: Tensor, prior: Prior, chart: str = "inverse_range") -> M
     Differentiable in the cells.
     """
     require(chart in ("inverse_range", "cartesian"), "chart", chart, "inverse_range or cartesian")
+    require_tensor(cells, "cells", "a tensor (..., cells, 3)")
     require(cells.dim() >= 2 and cells.shape[-1] == 3, "cells", tuple(cells.shape), "a shape (..., cells, 3)")
     require(cells.numel() > 0, "memory.cells", cells.shape[-2], "at least 1")
     require(cells.dtype in (torch.float32, torch.float64), "cells.dtype", cells.dtype, "torch.float32 or torch.float64")

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchfovea.finite import require_tensor
 from torchfovea.rounding import unrounded
 from torchfovea.sensing.kinematics import Eyes, Gaze, Kinematics, axes_meet, rig_frame, to_ego
 from torchfovea.setting import check_types, require
@@ -73,8 +74,8 @@ class Head:
     def __post_init__(self) -> None:
         """Raise SettingError for a head that cannot exist."""
         check_types(self, "head.")
-        positive = 0 < self.baseline_m < math.inf
-        require(positive, "head.baseline_m", self.baseline_m, "a positive distance in metres")
+        between = 0 < self.baseline_m <= 10  # more is millimetres
+        require(between, "head.baseline_m", self.baseline_m, "a positive distance in metres, at most 10")
         require(
             0 <= self.pan_limit_deg < 180, "head.pan_limit_deg", self.pan_limit_deg, "from 0 to less than 180 degrees"
         )
@@ -136,7 +137,12 @@ def eyes(head: Head | Kinematics, gaze: Gaze) -> Eyes:
     """Forward kinematics: the poses of both cameras in E (the left eye turns +θ/2 about the optical y, the right −θ/2).
 
     Differentiable in the gaze.
+
+    Raises:
+        SettingError: for a gaze of plain numbers.
     """
+    for angle in gaze:
+        require_tensor(angle, "gaze", "a Gaze of tensors, such as Gaze(*torch.zeros(3))")
     if not isinstance(head, Head):
         return head.eyes(gaze)
     rotation, origin = cyclopean(head, gaze)

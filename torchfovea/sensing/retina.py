@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchfovea.finite import require_finite
+from torchfovea.finite import require_finite, require_tensor
 from torchfovea.gaussian import columns
 from torchfovea.sensing.layout import LogPolar, Retina, Uniform, cortical
 from torchfovea.sensing.sampling import (
@@ -60,6 +60,7 @@ def fovea(image: Tensor, gaze_px: Tensor | None, retina: Retina, scale: float | 
     Differentiable in the image and the gaze (bilinear: piecewise smooth in the gaze). For torch.compile one graph, and
     clean for vmap.
     """
+    require_tensor(image, "image", "a tensor (B, C, H, W)")
     # a compiler's sizes may be symbols; a plan is made for numbers
     height, width = index(image.shape[-2]), index(image.shape[-1])
     scale = _checked_scale((height, width), retina, scale)
@@ -192,6 +193,7 @@ def _checked_scale(size: tuple[int, ...] | torch.Size, retina: Retina, scale: fl
 
 
 def _check_gaze(gaze_px: Tensor) -> None:
+    require_tensor(gaze_px, "gaze_px", "a tensor (B, 2) or (B, G, 2)")
     fits = gaze_px.dim() in (2, 3) and gaze_px.shape[-1] == 2
     require(fits, "gaze_px.shape", tuple(gaze_px.shape), "(B, 2) or (B, G, 2)")
     require_finite(gaze_px, "gaze_px", "finite pixels")
