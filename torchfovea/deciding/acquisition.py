@@ -261,10 +261,12 @@ def choose(score: Tensor, eligible: Tensor, generator: Generators | None = None)
     valid = eligible & ~score.isnan()
     score = score.expand(valid.shape)
     best = torch.where(valid, score, -torch.inf).amax(-1, keepdim=True)
-    lot = torch.arange(0, -score.shape[-1], -1, dtype=torch.float64, device=score.device)
-    if generator is not None:  # float64, for among thousands of float32 draws some would themselves tie
-        lot = draw(torch.rand, valid.shape, lot, generator)
-    winner = torch.where(valid & (score == best), lot, -torch.inf).argmax(-1)
+    tied = valid & (score == best)
+    if generator is None:
+        winner = tied.to(torch.uint8).argmax(-1)
+    else:  # float64, for among thousands of float32 draws some would themselves tie
+        like = torch.empty((), dtype=torch.float64, device=score.device)
+        winner = torch.where(tied, draw(torch.rand, valid.shape, like, generator), -1.0).argmax(-1)
     return torch.where(valid.any(-1), winner, -1)
 
 
