@@ -52,9 +52,9 @@ static void halve(const Four *from, int64_t height, int64_t width, int64_t strid
         const Four *restrict a = from + kept(2 * j - 1, height) * stride, *restrict b = from + 2 * j * stride;
         const Four *restrict c = from + kept(2 * j + 1, height) * stride, *restrict d = from + kept(2 * j + 2, height) * stride;
         Four *restrict out = to + j * line;
-        for (int64_t i = 0; i < width; i++) sum[i + 1] = a[i] + d[i] + 3 * (b[i] + c[i]);
+        for (int64_t i = 0; i < width; i++) sum[i + 1] = a[i] + d[i] + (REAL)3 * (b[i] + c[i]);
         sum[0] = sum[1], sum[width + 1] = sum[width + 2] = sum[width];
-        for (int64_t i = 0; i < columns; i++) out[i] = (sum[2 * i] + sum[2 * i + 3] + 3 * (sum[2 * i + 1] + sum[2 * i + 2])) * (REAL)(1.0 / 64);
+        for (int64_t i = 0; i < columns; i++) out[i] = (sum[2 * i] + sum[2 * i + 3] + (REAL)3 * (sum[2 * i + 1] + sum[2 * i + 2])) * (REAL)(1.0 / 64);
         for (int64_t i = columns; i < line; i++) out[i] = (Four){0};
     }
 }
