@@ -9,7 +9,7 @@ import torch
 
 from torchfovea.sensing.head import Gaze, Head, eyes
 from torchfovea.setting import SettingError
-from torchfovea.sim.head_model import CAMERAS, JOINTS
+from torchfovea.sim.head_model import JOINTS
 from torchfovea.sim.motor import InstantMotor, turned_deg
 from torchfovea.sim.scene import AttentionWorld, build_scene
 from torchfovea.sim.servo import ServoMotor
@@ -38,7 +38,7 @@ def test_mujocos_cameras_are_where_the_kinematics_say(scene, degrees):
     mujoco.mj_forward(scene.model, data)
     pose = eyes(scene.head, gaze)
     base = np.array([0.0, 0.0, scene.head.ego_height_m])
-    for name, rotation, centre in zip(CAMERAS, pose[::2], pose[1::2], strict=True):
+    for name, rotation, centre in zip(JOINTS[2:], pose[::2], pose[1::2], strict=True):
         camera = data.cam(name)
         # MuJoCo's cameras look along −z with y up
         assert np.abs(camera.xmat.reshape(3, 3) * [1, -1, -1] - rotation.numpy()).max() < 1e-12
@@ -57,7 +57,7 @@ def test_servos_settle_where_they_were_sent(scene):
         data = world.motor.data
         mujoco.mj_forward(scene.model, data)
         pose = eyes(scene.head, moved.gaze)
-        for name, rotation in zip(CAMERAS, pose[::2], strict=True):
+        for name, rotation in zip(JOINTS[2:], pose[::2], strict=True):
             assert np.abs(data.cam(name).xmat.reshape(3, 3) * [1, -1, -1] - rotation.numpy()).max() < 2e-5
         assert 0.01 < moved.seconds < 1.0
         assert abs(moved.degrees - turned_deg(scene.head, before, moved.gaze)) < 1e-9
