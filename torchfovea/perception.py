@@ -140,7 +140,7 @@ class Step(NamedTuple):
 def compiled(observer: Observer, mode: str = "auto") -> Observer:
     """The same observer, whose `perceive` and `decide` run as compiled kernels, with equal results to rounding.
 
-    On the CPU those are loops in C, which take a second or two to build the first time on a machine
+    On the CPU those are loops in C, which take some seconds to build the first time on a machine
     (`torchfovea.machine`); what no loop does runs as written. On a GPU PyTorch's compiler makes them, which takes half
     a minute (`torchfovea.compiling`).
 
